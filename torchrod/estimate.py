@@ -1,0 +1,175 @@
+"""Estimate loads from markers: iterate the filter on a batch until every sample has settled."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from . import ekf
+from .coordinates import PaperCoordinates
+from .jacobian import forward_jacobian
+from .measurement import Markers, Model
+from .result import Estimate, make_estimate
+from .rod import DTYPE
+from .statics import solve_shape
+from .status import Status
+
+CHUNK = 256  # samples per pass: the working set of one iteration stays in cache
+DECREMENT = 1e-3  # converged: a further step would lower the cost (chi^2) by less than this
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the filter is run. Sigma0, Q: the variances (per entry of x) it starts from and adds at every iteration (4).
+
+    step_limit: the largest change of any entry in one iteration. adaptive: residual-adaptive noise.
+    """
+
+    Sigma0: float | Float[Tensor, " n"] = 1.0
+    Q: float | Float[Tensor, " n"] = 1.0
+    step_limit: float = 0.6
+    adaptive: bool = True
+    max_iterations: int = 100
+
+
+def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
+    """The paper's plain recursion: no step limit, no adaptive noise. Q and Sigma0 multiply the squared sizes of its parameters."""
+    assert isinstance(model.coordinates, PaperCoordinates)
+    size = torch.tensor([10.0, 10.0, 1.0, 500.0], dtype=DTYPE).repeat(model.coordinates.count)
+    size = torch.cat([size, torch.full((model.size - len(size),), 0.1, dtype=DTYPE)])
+    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, 500)
+
+
+def cold_start(model: Model, markers: Markers) -> Float[Tensor, "B n"]:
+    """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
+    B = len(markers.positions)
+    rest = solve_shape(model.robot, (), markers.tension, markers.s[-1:], B, model.steps)
+    alpha = rest.base_wrench.nan_to_num(0.0)
+    return model.join(model.coordinates.start().expand(B, -1), alpha)
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """One evaluation of the model at x: residual, Jacobian, information of data and prior, cost, decrement."""
+
+    r: Float[Tensor, "B z"]
+    H: Float[Tensor, "B z n"]
+    A: Float[Tensor, "B n n"]
+    g: Float[Tensor, "B n"]
+    cost: Float[Tensor, " B"]
+    decrement: Float[Tensor, " B"]
+
+
+def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[Tensor, "B z"]) -> Linearized:
+    """r = z - h(x) (zero where a marker is missing), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
+    h, H = forward_jacobian(lambda x: model.h(x, markers), x)
+    z = torch.cat([markers.positions.flatten(1), h.new_zeros(len(h), 6)], -1)
+    r = torch.where(w > 0, z - h, 0.0)
+    mean, precision = model.prior()
+    A, g = ekf.information(H, r, w, x, mean, precision)
+    cost = (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+    return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
+
+
+def converged(model: Model, at: Linearized) -> Bool[Tensor, " B"]:
+    """The cost cannot be lowered by more than DECREMENT, and the rod is in equilibrium within one sigma of the tip residual."""
+    balanced = ((at.r[:, -6:] ** 2 * model.tip_weights(at.r)) < 1).all(-1)
+    return (at.decrement < DECREMENT) & balanced
+
+
+def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
+    """Samples with at least as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
+    enough = 3 * markers.present.sum(-1) >= model.size - 6
+    if markers.tension is not None:
+        enough = enough & torch.isfinite(markers.tension).all(-1)
+    return enough
+
+
+def _limited(step: Float[Tensor, "B n"], limit: float) -> Float[Tensor, "B n"]:
+    """The step, shortened so that no entry changes by more than the limit; zero where the update failed."""
+    step = step.nan_to_num(0.0, 0.0, 0.0)
+    return step * (limit / step.abs().amax(-1, keepdim=True).clamp(min=1e-300)).clamp(max=1.0)
+
+
+def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"]) -> Estimate:
+    """Iterate one chunk. Samples leave the batch when they have converged; a failed one never touches its neighbours."""
+    w = model.weights(markers, noise)
+    diagonal = torch.ones(model.size, dtype=x.dtype)
+    Sigma0, Q = torch.diag(settings.Sigma0 * diagonal), settings.Q * diagonal
+    mean, precision = model.prior()
+    B = len(x)
+    ok = usable(model, markers)
+    status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
+    iterations = torch.zeros(B, dtype=torch.int64)
+    x, before, Sigma = x.clone(), x.clone(), Sigma0.expand(B, -1, -1).clone()
+    live = ok.nonzero().squeeze(-1)
+    for _ in range(settings.max_iterations):
+        if not len(live):
+            break
+        here, wl = markers.take(live), w[live]
+        at = linearize(model, x[live], here, wl)
+        iterations[live] += 1
+        finite = torch.isfinite(at.cost) & torch.isfinite(at.A).flatten(1).all(-1)
+        done = converged(model, at) & finite
+        status[live[done]] = int(Status.CONVERGED)
+
+        A, g = at.A, at.g
+        if settings.adaptive:
+            A, g = ekf.information(at.H, at.r, ekf.adapted_weights(wl, 3 * len(markers.s), at.decrement), x[live], mean, precision)
+        step, Sigma_next = ekf.update(ekf.predict(Sigma[live], Q), A, g)
+        fresh = torch.isfinite(Sigma_next).flatten(1).all(-1) & finite
+        onward = x[live] + _limited(step, settings.step_limit)
+        # A model that overflowed says nothing: go half way back to the last place where it did.
+        onward = torch.where(finite.unsqueeze(-1), onward, 0.5 * (x[live] + before[live]))
+        before[live] = torch.where(finite.unsqueeze(-1), x[live], before[live])
+        x[live] = torch.where(done.unsqueeze(-1), x[live], onward)
+        Sigma[live] = torch.where(fresh[:, None, None], Sigma_next, Sigma0)
+        live = live[~done]
+    return make_estimate(model, markers, x, linearize(model, x, markers, w), status, iterations)
+
+
+def estimate(
+    model: Model,
+    markers: Markers,
+    noise: float,
+    settings: Settings | None = None,
+    start: Callable[[Model, Markers], Float[Tensor, "B n"]] = cold_start,
+    progress: Callable[[int], object] | None = None,
+) -> Estimate:
+    """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
+
+    noise: standard deviation of a marker coordinate (m). start: initial x. progress: called with the number of samples finished.
+    A sample's answer does not depend on its batch. Errors: ValueError for markers that do not fit the robot; a sample that cannot
+    be estimated is reported by its status. Source: the paper, section II; DESIGN.md section 3.
+    """
+    check(model, markers, noise)
+    parts = []
+    for first in range(0, len(markers.positions), CHUNK):
+        index = torch.arange(first, min(first + CHUNK, len(markers.positions)))
+        part = markers.take(index)
+        parts.append(_filter(model, part, noise, settings or Settings(), start(model, part)))
+        if progress is not None:
+            progress(len(index))
+    return Estimate.cat(parts)
+
+
+def check(model: Model, markers: Markers, noise: float) -> None:
+    """Raise ValueError, naming the remedy, for measurements that do not fit the robot or the model."""
+    L = model.robot.rod.length
+    tendons = len(model.robot.tendons)
+    if not noise > 0:
+        raise ValueError(f"noise is {noise} m; it must be positive")
+    if len(markers.s) == 0 or len(markers.positions) == 0:
+        raise ValueError("there are no markers; give at least one sample with markers")
+    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + 1e-9)).any()):
+        raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
+    if 3 * len(markers.s) < model.size - 6:
+        raise ValueError(
+            f"{len(markers.s)} markers cannot determine {model.size - 6} unknowns; add markers or drop loads or --registration"
+        )
+    if tendons and markers.tension is None:
+        raise ValueError(f"the robot has {tendons} tendons but the shapes carry no tensions; add tension_1..tension_{tendons}")
+    if markers.tension is not None and markers.tension.shape[-1] != tendons:
+        raise ValueError(f"the shapes carry {markers.tension.shape[-1]} tensions but the robot has {tendons} tendons")

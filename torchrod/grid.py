@@ -1,0 +1,62 @@
+"""The arc-length grid: where the steps of the integration begin and end."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+DEFAULT_STEPS = 40  # RK4 is then within 1e-7 m of the exact shape for ordinary loads (docs/model.md)
+SAME_POINT = 1e-9  # m: marker and tendon end closer than this share a node
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes (..., S + 1) in m, from the first to the last of them, and the node of each output, (..., P).
+
+    Outputs, tendon ends and jumps of the load are nodes, so no step straddles a discontinuity and no output is interpolated.
+    Nodes may differ from sample to sample (a point load's location is part of the state) and carry derivatives.
+    """
+
+    nodes: Float[Tensor, "... S1"]
+    outputs: Int[Tensor, "... P"]
+
+    @property
+    def h(self) -> Float[Tensor, "... S"]:
+        """Step lengths (m)."""
+        return self.nodes.diff(dim=-1)
+
+    @property
+    def stages(self) -> Float[Tensor, "... S 3"]:
+        """Arc lengths of the start, middle and end of every step (m)."""
+        a, b = self.nodes[..., :-1], self.nodes[..., 1:]
+        return torch.stack([a, 0.5 * (a + b), b], -1)
+
+    @property
+    def inside(self) -> Float[Tensor, "... S 3"]:
+        """The middle of each step, once for each of its three stages: decides on which side of a jump a stage lies."""
+        return self.stages[..., 1:2].expand_as(self.stages)
+
+
+def make_grid(
+    length: float,
+    outputs: Float[Tensor, " P"],
+    ends: tuple[float, ...] = (),
+    breakpoints: Float[Tensor, "... K"] | None = None,
+    steps: int = DEFAULT_STEPS,
+) -> Grid:
+    """Nodes at 0, L, the outputs, the tendon ends and the breakpoints, filled up so that no step is longer than L / steps (m)."""
+    fixed = torch.cat([outputs.new_tensor([0.0, length, *ends]), outputs]).sort().values
+    fixed = fixed[torch.cat([torch.tensor([True]), fixed.diff() > SAME_POINT])]
+    pieces = (fixed.diff() / (length / steps) - 1e-9).ceil().clamp(min=1).to(torch.int64)
+    fill = [
+        a + (b - a) * torch.arange(n, dtype=fixed.dtype) / n for a, b, n in zip(fixed[:-1], fixed[1:], pieces.tolist(), strict=True)
+    ]
+    nodes = torch.cat([*fill, fixed[-1:]])
+    at = (nodes.unsqueeze(0) - outputs.unsqueeze(-1)).abs().argmin(-1)
+    if breakpoints is None:
+        return Grid(nodes, at)
+    moving = breakpoints.clamp(0.0, length)
+    together = torch.cat([nodes.expand(*moving.shape[:-1], -1), moving], -1)
+    order = together.detach().argsort(dim=-1, stable=True)
+    return Grid(together.gather(-1, order), at + (moving.detach().unsqueeze(-2) < outputs.unsqueeze(-1)).sum(-1))

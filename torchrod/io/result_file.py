@@ -1,0 +1,107 @@
+"""RESULT: what the estimate found, as JSON for people and scripts or NPZ for large batches (docs/files.md)."""
+
+import json
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import InputError
+from ..result import Estimate
+from ..status import Status
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no NaN: an unknown number is null."""
+    return value if math.isfinite(value) else None
+
+
+def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
+    force, net = estimate.force[b].tolist(), estimate.net_force[b].tolist()
+    return [
+        {
+            "force_local_N": [_plain(v) for v in force[k]],
+            "magnitude_N": _plain(float(estimate.magnitude[b, k])),
+            "location_m": _plain(float(estimate.location[b, k])),
+            "width_m": _plain(float(estimate.width[b, k])),
+            "net_force_local_N": [_plain(v) for v in net[k]],
+            "std": {
+                "magnitude_N": _plain(float(estimate.magnitude_std[b, k])),
+                "location_m": _plain(float(estimate.location_std[b, k])),
+            },
+        }
+        for k in range(len(force))
+    ]
+
+
+def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
+    """One sample's entry of RESULT.json."""
+    wrench = [_plain(v) for v in estimate.base_wrench[b].tolist()]
+    record: dict[str, object] = {
+        "sample": int(sample) if sample.isdecimal() else sample,
+        "status": Status(int(estimate.status[b])).label,
+        "accepted": bool(estimate.accepted[b]),
+        "message": estimate.message(b),
+        "iterations": int(estimate.iterations[b]),
+        "warm_started": False,
+        "chi2": _plain(float(estimate.chi2[b])),
+        "dof": int(estimate.dof[b]),
+        "rms_residual_m": _plain(float(estimate.rms_residual[b])),
+        "loads": _loads(estimate, b),
+        "base_wrench": {"force_N": wrench[:3], "moment_Nm": wrench[3:]},
+    }
+    if estimate.registration is not None:
+        twist = [_plain(v) for v in estimate.registration[b].tolist()]
+        record["registration"] = {"translation_m": twist[:3], "rotation_rad": twist[3:]}
+    return record
+
+
+def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot: str) -> None:
+    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix."""
+    path = Path(path)
+    if path.suffix == ".json":
+        content = {"robot": robot, "results": [result_record(estimate, b, name) for b, name in enumerate(samples)]}
+        path.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        return
+    if path.suffix != ".npz":
+        raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
+    arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
+    np.savez_compressed(path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None})
+
+
+@dataclass(frozen=True)
+class FittedLoads:
+    """What a figure needs of one sample of a result file: loads in the section frame (N, m), their spread, and the base wrench."""
+
+    force: torch.Tensor
+    location: torch.Tensor
+    width: torch.Tensor
+    base_wrench: torch.Tensor
+
+
+def read_fit(path: str | Path, sample: str) -> FittedLoads:
+    """One sample of a RESULT.json or RESULT.npz. Errors: InputError naming file, sample and remedy."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                names = [str(n) for n in file["sample"]]
+                b = names.index(sample)
+                values = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
+        else:
+            results = json.loads(path.read_text(encoding="utf-8"))["results"]
+            names = [str(r["sample"]) for r in results]
+            record = results[names.index(sample)]
+            loads, wrench = record["loads"], record["base_wrench"]
+            values = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
+            values.append([*wrench["force_N"], *wrench["moment_Nm"]])
+    except (KeyError, TypeError, OSError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: is not a result of torchrod estimate ({error}); write it with --out") from None
+    except ValueError:
+        raise InputError(f"{path}: has no sample {sample}; choose one of those estimated with --sample") from None
+    tensors = [torch.tensor(np.array(v, dtype=float)) for v in values]
+    return FittedLoads(tensors[0].reshape(-1, 2), *tensors[1:])

@@ -1,0 +1,134 @@
+"""ROBOT.toml: the robot. Every refusal is one sentence with file, key and remedy."""
+
+import math
+import tomllib
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..errors import InputError
+from ..robot import Robot
+from ..rod import DTYPE, Rod
+from ..tendons import Tendon, Tendons
+
+TOP_KEYS = {"name", "rod", "tendons"}
+ROD_KEYS = {
+    "length",
+    "diameter",
+    "youngs_modulus",
+    "shear_modulus",
+    "mass_per_length",
+    "gravity",
+    "reference_curvature",
+    "K_se",
+    "K_bt",
+}
+TENDON_KEYS = {"offset", "routing", "ends_at"}
+
+
+def _table(where: str, value: object, known: set[str]) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be a table of keys; known keys: {', '.join(sorted(known))}")
+    for key in value:
+        if key not in known:
+            raise InputError(f"{where}: unknown key '{key}'; known keys: {', '.join(sorted(known))}")
+    return value
+
+
+def _number(where: str, value: object, positive: bool = False, least: float = -math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{where} is {value!r}; it must be a number in SI units")
+    if not math.isfinite(value):
+        raise InputError(f"{where} is {value}; it must be finite")
+    if (positive and value <= 0) or value < least:
+        raise InputError(f"{where} is {value}; it must be {'positive' if positive else f'at least {least:g}'}")
+    return float(value)
+
+
+def _numbers(where: str, value: object, count: int) -> list[float]:
+    if not isinstance(value, list) or len(value) != count:
+        raise InputError(f"{where} is {value!r}; it must be a list of {count} numbers")
+    return [_number(where, v) for v in value]
+
+
+def _rows(where: str, value: object, count: int) -> list[list[float]]:
+    """A table given as a list of rows whose first entry, s, increases."""
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{where} must be a list of rows of {count} numbers, s first")
+    rows = [_numbers(f"{where}[{i}]", row, count) for i, row in enumerate(value)]
+    if any(b[0] <= a[0] for a, b in zip(rows, rows[1:], strict=False)):
+        raise InputError(f"{where}: s must increase from row to row")
+    return rows
+
+
+def _stiffness(where: str, value: object) -> torch.Tensor:
+    """Three numbers (the diagonal) or three rows of three: symmetric positive definite."""
+    if isinstance(value, list) and len(value) == 3 and all(isinstance(row, list) for row in value):
+        K = torch.tensor([_numbers(f"{where}[{i}]", row, 3) for i, row in enumerate(value)], dtype=DTYPE)
+    else:
+        K = torch.diag(torch.tensor(_numbers(where, value, 3), dtype=DTYPE))
+    if not torch.allclose(K, K.mT) or int(torch.linalg.cholesky_ex(K).info) != 0:
+        raise InputError(f"{where} must be symmetric positive definite, in N (K_se) or N m^2 (K_bt)")
+    return K
+
+
+def _rod(path: Path, table: dict[str, Any]) -> Rod:
+    where = f"{path}: rod"
+    if "length" not in table:
+        raise InputError(f"{where}.length is missing; give the rod's length in metres")
+    length = _number(f"{where}.length", table["length"], positive=True)
+    mass = _number(f"{where}.mass_per_length", table.get("mass_per_length", 0.0), least=0.0)
+    curvature = table.get("reference_curvature")
+    if isinstance(curvature, list) and curvature and not isinstance(curvature[0], list):
+        curvature = [[0.0, *curvature]]
+    rows = None if curvature is None else torch.tensor(_rows(f"{where}.reference_curvature", curvature, 4), dtype=DTYPE)
+    if not 1e-3 <= length <= 10:
+        warnings.warn(f"{where}.length is {length} m, unusual for a continuum robot; are the units metres?", stacklevel=2)
+    if "K_se" in table or "K_bt" in table:
+        for key in ("K_se", "K_bt"):
+            if key not in table:
+                raise InputError(f"{where}.{key} is missing; K_se and K_bt are given together")
+        return Rod.from_stiffness(length, *(_stiffness(f"{where}.{k}", table[k]) for k in ("K_se", "K_bt")), mass, rows)
+    for key in ("diameter", "youngs_modulus", "shear_modulus"):
+        if key not in table:
+            raise InputError(f"{where}.{key} is missing; give diameter, youngs_modulus and shear_modulus, or K_se and K_bt")
+    diameter, E, G = (_number(f"{where}.{k}", table[k], positive=True) for k in ("diameter", "youngs_modulus", "shear_modulus"))
+    if diameter > length or E < 1e3 or G > E:
+        warnings.warn(f"{where}: diameter {diameter} m, youngs_modulus {E} Pa, shear_modulus {G} Pa: check the units", stacklevel=2)
+    return Rod.circular(length, diameter, E, G, mass, rows)
+
+
+def _tendon(where: str, value: object, length: float) -> Tendon:
+    table = _table(where, value, TENDON_KEYS)
+    if ("offset" in table) == ("routing" in table):
+        raise InputError(f"{where} needs either offset = [x, y] or routing = [[s, x, y], ...], in metres")
+    ends_at = _number(f"{where}.ends_at", table.get("ends_at", length), positive=True)
+    if ends_at > length * (1 + 1e-9):
+        raise InputError(f"{where}.ends_at is {ends_at} m, beyond the rod's length of {length} m")
+    if "offset" in table:
+        return Tendon.straight(*_numbers(f"{where}.offset", table["offset"], 2), ends_at)
+    return Tendon(tuple((s, x, y) for s, x, y in _rows(f"{where}.routing", table["routing"], 3)), ends_at)
+
+
+def read_robot(path: str | Path) -> Robot:
+    """A robot from ROBOT.toml (docs/files.md). SI units. Errors: InputError naming file, key and remedy."""
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: is not valid TOML ({error})") from None
+    if "rod" not in content:
+        raise InputError(f"{path}: has no [rod] table; give at least length, diameter, youngs_modulus and shear_modulus")
+    _table(str(path), content, TOP_KEYS)
+    table = _table(f"{path}: rod", content["rod"], ROD_KEYS)
+    rod = _rod(path, table)
+    gravity = torch.tensor(_numbers(f"{path}: rod.gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3), dtype=DTYPE)
+    listed = content.get("tendons", [])
+    if not isinstance(listed, list):
+        raise InputError(f"{path}: tendons must be an array of tables, [[tendons]]")
+    tendons = Tendons(tuple(_tendon(f"{path}: tendons[{i}]", t, rod.length) for i, t in enumerate(listed)))
+    return Robot(rod, tendons, gravity, str(content.get("name", path.stem)))

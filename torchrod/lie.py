@@ -1,0 +1,78 @@
+"""Rotations and 3-vectors: the bottom of the house.
+
+The rod's orientation is a unit quaternion q = (x, y, z, w), RoMa's order, so that everything RoMa offers (rotation vectors,
+matrices, interpolation) applies to it. RoMa does the conversions; this module adds only the pointwise algebra of the
+arc-length step, which must stay free of branches and of 0/0 at zero rotation so that forward-mode derivatives are exact there.
+"""
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Vector = Float[Tensor, "... 3"]
+Matrix = Float[Tensor, "... 3 3"]
+Quaternion = Float[Tensor, "... 4"]
+Twist = Float[Tensor, "... 6"]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """a x b along the last dimension; leading dimensions broadcast."""
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=-1)
+
+
+def matvec(A: Matrix, x: Vector) -> Vector:
+    """A x with A (..., 3, 3) and x (..., 3), written pointwise so that a sample's result never depends on its batch."""
+    return (A * x.unsqueeze(-2)).sum(-1)
+
+
+def hat(a: Vector) -> Matrix:
+    """The skew matrix with hat(a) b = a x b."""
+    x, y, z = a.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+
+
+def inverse3(A: Matrix) -> Matrix:
+    """Inverse of (..., 3, 3) by cofactors: pointwise, no pivoting; for the well-conditioned matrices of the strain balance."""
+    a, b, c = A.unbind(-1)
+    rows = torch.stack([cross(b, c), cross(c, a), cross(a, b)], -2)
+    return rows / (a * cross(b, c)).sum(-1)[..., None, None]
+
+
+def rotate(q: Quaternion, a: Vector) -> Vector:
+    """R(q) a: from the section frame into the base frame."""
+    t = 2.0 * cross(q[..., :3], a)
+    return a + q[..., 3:] * t + cross(q[..., :3], t)
+
+
+def unrotate(q: Quaternion, a: Vector) -> Vector:
+    """R(q)^T a: from the base frame into the section frame."""
+    t = 2.0 * cross(q[..., :3], a)
+    return a - q[..., 3:] * t + cross(q[..., :3], t)
+
+
+def quaternion_rate(q: Quaternion, u: Vector) -> Quaternion:
+    """q' = q (u, 0) / 2, the quaternion form of R' = R hat(u), with u (1/m) in the section frame."""
+    w = q[..., 3:]
+    vector = w * u + cross(q[..., :3], u)
+    return 0.5 * torch.cat([vector, -(q[..., :3] * u).sum(-1, keepdim=True)], -1)
+
+
+def normalized(q: Quaternion) -> Quaternion:
+    """q / |q|."""
+    return q / (q * q).sum(-1, keepdim=True).sqrt()
+
+
+def identity_quaternion(shape: tuple[int, ...], like: Tensor) -> Quaternion:
+    """Unit quaternions of no rotation, of shape (*shape, 4), with the dtype and device of `like`."""
+    return like.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*shape, 4)
+
+
+def move(zeta: Twist, p: Float[Tensor, "... P 3"]) -> Float[Tensor, "... P 3"]:
+    """Rigid motion of points: exp(rotation) p + translation, with zeta = [translation (m), rotation vector (rad)] (..., 6).
+
+    The derivative at zeta = 0 is exact (RoMa's series). Source: the registration transform of the paper, section II.D.
+    """
+    R = roma.rotvec_to_rotmat(zeta[..., 3:])
+    return matvec(R.unsqueeze(-3), p) + zeta[..., None, :3]

@@ -1,0 +1,148 @@
+"""The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.stats import chi2 as chi2_distribution
+from torch import Tensor
+
+from . import ekf
+from .coordinates import LoadReport
+from .jacobian import forward_jacobian
+from .measurement import Markers, Model
+from .status import Status
+
+if TYPE_CHECKING:
+    from .estimate import Linearized
+
+ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Everything known of B samples after the fit. Status codes are torchrod.Status; SI units; forces in the section frame.
+
+    x, covariance: the state in the model's coordinates and its posterior (H^T W H + P)^-1 with the true noise.
+    force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
+    net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
+    base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line (B, P, 3) m: the fitted rod at the markers,
+    in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
+    chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
+    """
+
+    x: Float[Tensor, "B n"]
+    covariance: Float[Tensor, "B n n"]
+    force: Float[Tensor, "B K 2"]
+    location: Float[Tensor, "B K"]
+    width: Float[Tensor, "B K"]
+    load_covariance: Float[Tensor, "B K 4 4"]
+    net_force: Float[Tensor, "B K 2"]
+    base_wrench: Float[Tensor, "B 6"]
+    registration: Float[Tensor, "B 6"] | None
+    centre_line: Float[Tensor, "B P 3"]
+    residual: Float[Tensor, "B P 3"]
+    chi2: Float[Tensor, " B"]
+    dof: Int[Tensor, " B"]
+    accepted: Bool[Tensor, " B"]
+    iterations: Int[Tensor, " B"]
+    status: Int[Tensor, " B"]
+
+    @property
+    def magnitude(self) -> Float[Tensor, "B K"]:
+        """|F| (N)."""
+        return self.force.norm(dim=-1)
+
+    @property
+    def magnitude_std(self) -> Float[Tensor, "B K"]:
+        """Standard deviation of |F| (N), along the force's direction; where there is no force, of one component."""
+        C = self.load_covariance[..., :2, :2]
+        size = self.magnitude.unsqueeze(-1)
+        along = torch.where(size > 0, self.force / size, torch.full_like(self.force, 0.5**0.5))
+        return (along.unsqueeze(-2) @ C @ along.unsqueeze(-1)).squeeze(-1).squeeze(-1).clamp(min=0).sqrt()
+
+    @property
+    def location_std(self) -> Float[Tensor, "B K"]:
+        """Standard deviation of the location (m)."""
+        return self.load_covariance[..., 2, 2].clamp(min=0).sqrt()
+
+    @property
+    def rms_residual(self) -> Float[Tensor, " B"]:
+        """Root of the mean squared distance between measured and fitted markers (m), over those that were seen."""
+        return self.residual.square().sum(-1).nanmean(-1).sqrt()
+
+    def message(self, sample: int) -> str:
+        """One sentence on what became of a sample, with the remedy."""
+        status = Status(int(self.status[sample]))
+        if status is Status.CONVERGED and not self.accepted[sample]:
+            return (
+                f"Converged, but chi2 = {float(self.chi2[sample]):.3g} for {int(self.dof[sample])} degrees of freedom: the model does not "
+                "explain the markers; allow more contacts, state more noise, or check tensions, gravity and registration."
+            )
+        return status.message
+
+    @staticmethod
+    def cat(parts: list["Estimate"]) -> "Estimate":
+        """Join the estimates of several chunks."""
+
+        def joined(values: list[Tensor | None]) -> Tensor | None:
+            present = [v for v in values if v is not None]
+            return torch.cat(present) if present else None
+
+        return Estimate(**{f.name: joined([getattr(p, f.name) for p in parts]) for f in fields(Estimate)})  # pyright: ignore[reportArgumentType]
+
+
+def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B K 4 4"]:
+    """Covariance of [F_x, F_y, location, width] per load, carried over from x by the derivative of `describe`."""
+    n = model.coordinates.size
+
+    def described(gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B k4"]:
+        report = model.coordinates.describe(gamma)
+        return torch.cat([report.force, report.location.unsqueeze(-1), report.width.unsqueeze(-1)], -1).flatten(-2)
+
+    _, J = forward_jacobian(described, x[:, :n])
+    J = J.unflatten(1, (-1, 4))
+    return J @ covariance[:, None, :n, :n] @ J.transpose(-1, -2)
+
+
+def make_estimate(
+    model: Model,
+    markers: Markers,
+    x: Float[Tensor, "B n"],
+    at: "Linearized",
+    status: Int[Tensor, " B"],
+    iterations: Int[Tensor, " B"],
+) -> Estimate:
+    """Assemble the result from the last linearization; a sample that is invalid holds NaN throughout."""
+    valid = (status != int(Status.INVALID)) & torch.isfinite(at.cost)
+    status = torch.where(valid, status, int(Status.INVALID))
+
+    def kept(value: Tensor) -> Tensor:
+        return torch.where(valid.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
+
+    gamma, zeta, alpha = model.split(x)
+    report: LoadReport = model.coordinates.describe(gamma)
+    covariance = ekf.posterior(at.A)
+    present = markers.present
+    dof = 3 * present.sum(-1) + 6 + model.coordinates.informative_priors - model.size
+    limit = torch.from_numpy(chi2_distribution.ppf(ACCEPT, dof.clamp(min=1).numpy()))
+    residual = at.r[:, :-6].unflatten(-1, (-1, 3))
+    return Estimate(
+        x=kept(x),
+        covariance=kept(covariance),
+        force=kept(report.force),
+        location=kept(report.location),
+        width=kept(report.width),
+        load_covariance=kept(load_covariance(model, x, covariance)),
+        net_force=kept(report.net_force),
+        base_wrench=kept(alpha),
+        registration=None if zeta is None else kept(zeta),
+        centre_line=kept(model.shape(x, markers).p),
+        residual=torch.where(present.unsqueeze(-1), kept(residual), torch.nan),
+        chi2=kept(at.cost),
+        dof=dof,
+        accepted=(at.cost < limit) & (status == int(Status.CONVERGED)),
+        iterations=iterations,
+        status=status,
+    )

@@ -1,0 +1,259 @@
+"""Statics of the whole rod: march the arc-length step along it, and solve for the shape under known loads.
+
+March base to tip: the base wrench alpha = [n(0), m(0)] is given and the tip need not be in equilibrium: the estimator's model.
+March tip to base: the wrench is known at the tip (there is nothing beyond it), so only the tip's orientation is unknown, and
+not even that when no load keeps its direction in the base frame; this is the forward solve.
+"""
+
+from dataclasses import dataclass
+
+import roma
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .grid import DEFAULT_STEPS, Grid, make_grid
+from .jacobian import forward_jacobian
+from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, matvec, normalized, rotate
+from .loads import Load, LoadIntegrals, total
+from .robot import Robot
+from .status import Status
+from .step import STATE_PARTS, Section, StageTable, State, rk4_step, section_wrench
+
+ORIENTATION_TOLERANCE = 1e-11  # rad: the forward solve's residual, far below what RK4 leaves
+MAX_NEWTON = 40
+LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put on in increments, to stay on the principal branch
+
+
+def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid) -> StageTable:
+    """All that is known along the rod, at the stages of every step of the grid. tension: (..., T), N."""
+    s, inside = grid.stages, grid.inside
+    integrals = total(loads, s, inside) + robot.weight_beyond(s)
+    tendons = None
+    if len(robot.tendons) and tension is not None:
+        tendons = robot.tendons.table(s, inside, tension[..., None, None, :])
+    return StageTable(integrals, robot.rod.curvature_at(s), tendons)
+
+
+def grid_for(robot: Robot, loads: tuple[Load, ...], outputs: Float[Tensor, " P"], steps: int) -> Grid:
+    """The grid that serves this robot, these loads and these output arc lengths (m)."""
+    jumps = [b for b in (load.breakpoints() for load in loads) if b is not None]
+    leading = torch.broadcast_shapes(*(b.shape[:-1] for b in jumps)) if jumps else ()
+    breakpoints = torch.cat([b.expand(*leading, -1) for b in jumps], -1) if jumps else None
+    return make_grid(robot.rod.length, outputs, robot.tendons.ends, breakpoints, steps)
+
+
+def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bool = False) -> Float[Tensor, "... S1 13"]:
+    """The state at every node, in the order of the nodes; `reverse` starts from the last node."""
+    h, states = grid.h, [y]
+    steps = range(h.shape[-1])
+    table = table.reversed() if reverse else table
+    for i in reversed(steps) if reverse else steps:
+        at, length = table.step(i), h[..., i]
+        y = rk4_step(section, y, at, -length) if reverse else rk4_step(section, y, at, length)
+        states.append(y)
+    return torch.stack(states[::-1] if reverse else states, -2)
+
+
+def beyond_tip(robot: Robot, loads: tuple[Load, ...], like: Tensor) -> LoadIntegrals:
+    """The load integrals just beyond the tip, where every load, one at the tip itself included, has been passed."""
+    tip = like.new_full((1, 3), robot.rod.length)
+    integrals = total(loads, tip, torch.full_like(tip, torch.inf))
+
+    def first(x: Vector | None) -> Vector | None:
+        return None if x is None else x[..., 0, 0, :]
+
+    return LoadIntegrals(first(integrals.G), first(integrals.G2), first(integrals.Gm))
+
+
+def base_state(robot: Robot, alpha: Float[Tensor, "... 6"], table: StageTable) -> State:
+    """y(0) from the base wrench alpha = [n(0) (N), m(0) (N m)]: by (1) of torchrod.step with G(0) = 0 and R(0) = I."""
+    N, M = alpha[..., :3], alpha[..., 3:]
+    if table.loads.Wn is not None:
+        N = N - table.loads.Wn[..., 0, 0, :]
+    if table.loads.Wm is not None:
+        M = M - table.loads.Wm[..., 0, 0, :]
+    N, M = torch.broadcast_tensors(N, M)
+    q = identity_quaternion(N.shape[:-1], N)
+    return torch.cat([torch.zeros_like(N), q, N, M], -1)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The rod at the outputs: p (..., P, 3) m, q (..., P, 4), and the tip residual c (..., 6) [N, N m], section frame."""
+
+    p: Float[Tensor, "... P 3"]
+    q: Float[Tensor, "... P 4"]
+    tip_residual: Float[Tensor, "... 6"]
+
+
+def _take(values: Float[Tensor, "... S1 c"], at: Int[Tensor, "... P"]) -> Float[Tensor, "... P c"]:
+    if at.ndim == 1:
+        return values[..., at, :]
+    return values.gather(-2, at.unsqueeze(-1).expand(*values.shape[:-2], at.shape[-1], values.shape[-1]))
+
+
+def shape_from_base(
+    robot: Robot,
+    loads: tuple[Load, ...],
+    alpha: Float[Tensor, "... 6"],
+    tension: Float[Tensor, "... T"] | None,
+    outputs: Float[Tensor, " P"],
+    steps: int,
+) -> Shape:
+    """March base to tip under alpha. Tip residual (17): the wrench carried just beyond the tip, which is zero in equilibrium:
+
+    c = [N~ - G, M~ + e3 x G2 - Gm] at s = L+
+    """
+    grid = grid_for(robot, loads, outputs, steps)
+    table = stage_table(robot, loads, tension, grid)
+    section = Section.of(robot.rod.K_se, robot.rod.K_bt)
+    y0 = base_state(robot, alpha, table)
+    states = march(section, y0, table, grid)
+    p, q, N, M = states.split(STATE_PARTS, -1)
+    c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond_tip(robot, loads, alpha))
+    return Shape(_take(p, grid.outputs), _take(q, grid.outputs), torch.cat(c, -1))
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """The forward solve's answer, one entry per sample.
+
+    s: (P,) m. p: (B, P, 3) m and q: (B, P, 4), base frame. base_wrench: (B, 6) = [n(0) N, m(0) N m], the whole section's.
+    status: (B,) Status codes; residual: (B,) rad, the angle by which the base misses its clamp; iterations: (B,).
+    A sample that failed holds NaN and has disturbed nobody.
+    """
+
+    s: Float[Tensor, " P"]
+    p: Float[Tensor, "B P 3"]
+    q: Float[Tensor, "B P 4"]
+    base_wrench: Float[Tensor, "B 6"]
+    status: Int[Tensor, " B"]
+    residual: Float[Tensor, " B"]
+    iterations: Int[Tensor, " B"]
+
+
+@dataclass(frozen=True)
+class _TipProblem:
+    """March tip to base from a guessed tip orientation, with the loads of the base frame scaled by a fraction per sample."""
+
+    section: Section
+    table: StageTable
+    grid: Grid
+    wrench: Float[Tensor, "B 6"]
+
+    def states(self, q_tip: Quaternion, fraction: Float[Tensor, " B"]) -> Float[Tensor, "... S1 13"]:
+        y = torch.cat([torch.zeros_like(q_tip[..., :3]), q_tip, self.wrench.expand(*q_tip.shape[:-1], 6)], -1)
+        return march(self.section, y, self.table.with_base_frame_loads_scaled(fraction), self.grid, reverse=True)
+
+    def base_rotation(self, q_tip: Quaternion, fraction: Float[Tensor, " B"]) -> Vector:
+        """r(q_tip): the rotation vector by which the base misses the identity (rad)."""
+        return roma.unitquat_to_rotvec(self.states(q_tip, fraction)[..., 0, 3:7])
+
+    def newton_step(self, q_tip: Quaternion, fraction: Float[Tensor, " B"]) -> tuple[Vector, Vector]:
+        """r, and the tip's turn -J^-1 r in the base frame."""
+        r, J = forward_jacobian(lambda w: self.base_rotation(turned(w, q_tip), fraction), torch.zeros_like(q_tip[..., :3]))
+        return r, -matvec(inverse3(J), r)
+
+
+def turned(w: Vector, q: Quaternion) -> Quaternion:
+    """exp(w) q, w (rad) in the base frame."""
+    return roma.quat_product(roma.rotvec_to_unitquat(w), q.expand(*w.shape[:-1], 4))
+
+
+def _newton(
+    problem: _TipProblem, q: Quaternion, fraction: Float[Tensor, " B"]
+) -> tuple[Quaternion, Float[Tensor, " B"], Int[Tensor, " B"]]:
+    """Damped Newton on the tip's orientation: the best orientation, its residual (rad) and the iterations taken."""
+    best = torch.full_like(fraction, torch.inf)
+    anchor, turn, damping = q, torch.zeros_like(q[..., :3]), torch.ones_like(best)
+    iterations = torch.zeros(best.shape, dtype=torch.int64)
+    for _ in range(MAX_NEWTON):
+        r, step = problem.newton_step(q, fraction)
+        size = r.norm(dim=-1)
+        better = size < best
+        anchor, turn = torch.where(better.unsqueeze(-1), q, anchor), torch.where(better.unsqueeze(-1), step, turn)
+        best, damping = torch.where(better, size, best), torch.where(better, 1.0, 0.5 * damping)
+        active = (best > ORIENTATION_TOLERANCE) & torch.isfinite(best) & (damping > 1e-3)
+        iterations = iterations + active
+        if not active.any():
+            break
+        scale = (damping / turn.norm(dim=-1).clamp(min=1.0)).unsqueeze(-1)
+        q = torch.where(active.unsqueeze(-1), normalized(turned(scale * turn, anchor)), anchor)
+    return anchor, best, iterations
+
+
+def _increments(robot: Robot, table: StageTable, B: int) -> Int[Tensor, " B"]:
+    """How many increments put on the base frame's loads, per sample: so many that each is below LOAD_PER_INCREMENT (EI / L^2)."""
+    L, EI = robot.rod.length, robot.rod.bending_stiffness
+    load = torch.zeros(B, dtype=robot.rod.K_bt.dtype)
+    for wrench, lever in ((table.loads.Wn, L * L), (table.loads.Wm, L)):
+        if wrench is not None:
+            load = load + wrench.norm(dim=-1).flatten(-2).amax(-1) * lever / EI
+    return (load.nan_to_num(0.0, 0.0) / LOAD_PER_INCREMENT).ceil().clamp(1, 100).to(torch.int64)
+
+
+def solve_shape(
+    robot: Robot,
+    loads: tuple[Load, ...],
+    tension: Float[Tensor, "B T"] | None,
+    outputs: Float[Tensor, " P"],
+    batch: int,
+    steps: int = DEFAULT_STEPS,
+) -> Equilibrium:
+    """The forward solve: the shape of `batch` samples under known loads and tensions, and the wrench at their base.
+
+    Marches tip to base and turns the tip until the base sits in its clamp, R(0) = I: at once without base-frame loads, by damped
+    Newton on three numbers with them. Loads (B, ...) in their own frames and units (torchrod.loads), tension N, outputs m.
+    Errors: none raised for numbers; a sample that cannot be solved has status NOT_CONVERGED, one that holds NaN INVALID.
+    Source: DESIGN.md section 2.
+    """
+    grid = grid_for(robot, loads, outputs, steps)
+    table = stage_table(robot, loads, tension, grid)
+    section = Section.of(robot.rod.K_se, robot.rod.K_bt)
+    beyond = beyond_tip(robot, loads, outputs)
+    zero = outputs.new_zeros(batch, 3)
+    # At L+ the section carries nothing: N = M = 0 in (1), hence N~ = G and M~ = Gm - e3 x G2 there.
+    N = zero if beyond.G is None else zero + beyond.G
+    M = zero if beyond.G2 is None else zero - cross(section.e3, beyond.G2)
+    problem = _TipProblem(section, table, grid, torch.cat([N, M if beyond.Gm is None else M + beyond.Gm], -1))
+
+    q, one = identity_quaternion((batch,), zero), torch.ones_like(zero[:, 0])
+    q = turned(-problem.base_rotation(q, 0 * one), q)  # exact where no load keeps its direction in the base frame
+    residual, iterations = 0 * one, torch.zeros(batch, dtype=torch.int64)
+    if table.loads.Wn is not None or table.loads.Wm is not None:
+        increments = _increments(robot, table, batch)
+        for k in range(1, int(increments.max()) + 1):
+            q, residual, more = _newton(problem, q, (k / increments).clamp(max=1.0).to(one.dtype))
+            iterations = iterations + more
+    return _equilibrium(problem, q, residual, iterations, outputs)
+
+
+def _equilibrium(
+    problem: _TipProblem,
+    q_tip: Quaternion,
+    residual: Float[Tensor, " B"],
+    iterations: Int[Tensor, " B"],
+    outputs: Float[Tensor, " P"],
+) -> Equilibrium:
+    states = problem.states(q_tip, torch.ones_like(residual))
+    p, q, N, M = states.split(STATE_PARTS, -1)
+    base = problem.table.step(0).stage(0).loads
+    base = LoadIntegrals(Wn=base.Wn, Wm=base.Wm)
+    n0, m0 = section_wrench(q[:, 0], N[:, 0], M[:, 0], problem.section.e3, base)
+    wrench = torch.cat([rotate(q[:, 0], n0), rotate(q[:, 0], m0)], -1)
+    finite = torch.isfinite(states).flatten(1).all(-1)
+    solved = finite & (residual <= 10 * ORIENTATION_TOLERANCE)
+    status = torch.full_like(iterations, int(Status.NOT_CONVERGED))
+    status = torch.where(solved, int(Status.CONVERGED), torch.where(finite, status, int(Status.INVALID)))
+    at = problem.grid.outputs
+    keep = solved[:, None, None]
+    return Equilibrium(
+        outputs,
+        torch.where(keep, _take(p - p[:, :1], at), torch.nan),
+        torch.where(keep, _take(q, at), torch.nan),
+        torch.where(solved.unsqueeze(-1), wrench, torch.nan),
+        status,
+        residual,
+        iterations,
+    )

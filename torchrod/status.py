@@ -1,0 +1,28 @@
+"""What became of a sample, and what its owner can do about it."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Outcome per sample; `.label` is the word that files carry, `.message` names the remedy."""
+
+    CONVERGED = 0
+    NOT_CONVERGED = 1
+    INVALID = 2
+
+    @property
+    def label(self) -> str:
+        """The contract's word for it: converged, not_converged, invalid."""
+        return self.name.lower()
+
+    @property
+    def message(self) -> str:
+        """One sentence, with the remedy where there is something to do."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.CONVERGED: "Converged.",
+    Status.NOT_CONVERGED: "Did not converge: check units, marker order and tensions first, then state more noise or allow more iterations.",
+    Status.INVALID: "Not enough finite numbers: give this sample more markers (and finite tensions), or fewer unknown loads.",
+}
