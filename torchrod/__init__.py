@@ -1,0 +1,88 @@
+"""torchrod: forces from shape. Estimates the external loads on continuum robots from measured marker positions.
+
+This module is the whole public surface. Batch dimension first, physical dimensions last; SI units; float64.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
+    from .errors import InputError
+    from .estimate import Settings, cold_start, estimate, paper_settings
+    from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
+    from .jacobian import forward_jacobian
+    from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
+    from .measurement import Markers, Model
+    from .plot import draw
+    from .result import Estimate, Fit
+    from .robot import Robot
+    from .rod import Rod
+    from .statics import Equilibrium, Shape, shape_from_base, solve_shape
+    from .status import Status
+    from .tendons import Tendon, Tendons
+
+_HOMES = {
+    "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
+    "errors": ("InputError",),
+    "estimate": ("Settings", "cold_start", "estimate", "paper_settings"),
+    "io": ("Shapes", "read_robot", "read_shapes", "write_result", "write_shapes"),
+    "jacobian": ("forward_jacobian",),
+    "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),
+    "measurement": ("Markers", "Model"),
+    "plot": ("draw",),
+    "result": ("Estimate", "Fit"),
+    "robot": ("Robot",),
+    "rod": ("Rod",),
+    "statics": ("Equilibrium", "Shape", "shape_from_base", "solve_shape"),
+    "status": ("Status",),
+    "tendons": ("Tendon", "Tendons"),
+}
+__all__ = [
+    "Equilibrium",
+    "Estimate",
+    "Fit",
+    "FourierCoordinates",
+    "FourierLoads",
+    "GaussianCoordinates",
+    "GaussianLoads",
+    "InputError",
+    "Markers",
+    "Model",
+    "PaperCoordinates",
+    "PointCoordinates",
+    "PointForces",
+    "PointWrenches",
+    "PolynomialLoads",
+    "Robot",
+    "Rod",
+    "Settings",
+    "Shape",
+    "Shapes",
+    "Status",
+    "Tendon",
+    "Tendons",
+    "cold_start",
+    "draw",
+    "estimate",
+    "forward_jacobian",
+    "paper_settings",
+    "read_robot",
+    "read_shapes",
+    "shape_from_base",
+    "solve_shape",
+    "write_result",
+    "write_shapes",
+]
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name on first use, so that `torchrod --help` need not wait for torch."""
+    for home, names in _HOMES.items():
+        if name in names:
+            value = getattr(importlib.import_module(f".{home}", __name__), name)
+            globals()[name] = value
+            return value
+    raise AttributeError(f"module 'torchrod' has no attribute {name!r}")

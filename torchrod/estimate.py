@@ -73,12 +73,6 @@ def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[
     return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
 
 
-def converged(model: Model, at: Linearized) -> Bool[Tensor, " B"]:
-    """The cost cannot be lowered by more than DECREMENT, and the rod is in equilibrium within one sigma of the tip residual."""
-    balanced = ((at.r[:, -6:] ** 2 * model.tip_weights(at.r)) < 1).all(-1)
-    return (at.decrement < DECREMENT) & balanced
-
-
 def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
     """Samples with at least as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
     enough = 3 * markers.present.sum(-1) >= model.size - 6
@@ -112,7 +106,7 @@ def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x:
         at = linearize(model, x[live], here, wl)
         iterations[live] += 1
         finite = torch.isfinite(at.cost) & torch.isfinite(at.A).flatten(1).all(-1)
-        done = converged(model, at) & finite
+        done = (at.decrement < DECREMENT) & finite
         status[live[done]] = int(Status.CONVERGED)
 
         A, g = at.A, at.g

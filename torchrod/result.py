@@ -1,5 +1,6 @@
 """The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from . import ekf
 from .coordinates import LoadReport
 from .jacobian import forward_jacobian
+from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from .measurement import Markers, Model
 from .status import Status
 
@@ -82,6 +84,14 @@ class Estimate:
             )
         return status.message
 
+    def fit(self, sample: int) -> "Fit":
+        """What a figure needs of one sample."""
+        zeta = None if self.registration is None else self.registration[sample]
+        there = torch.isfinite(self.location[sample])
+        return Fit(
+            self.force[sample][there], self.location[sample][there], self.width[sample][there], self.base_wrench[sample], zeta
+        )
+
     @staticmethod
     def cat(parts: list["Estimate"]) -> "Estimate":
         """Join the estimates of several chunks."""
@@ -91,6 +101,28 @@ class Estimate:
             return torch.cat(present) if present else None
 
         return Estimate(**{f.name: joined([getattr(p, f.name) for p in parts]) for f in fields(Estimate)})  # pyright: ignore[reportArgumentType]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
+    wrench (6,) [N, N m], and the registration (6,) [m, rad] that carries the rod into the measured frame, or None.
+    """
+
+    force: Float[Tensor, "K 2"]
+    location: Float[Tensor, " K"]
+    width: Float[Tensor, " K"]
+    base_wrench: Float[Tensor, " 6"]
+    registration: Float[Tensor, " 6"] | None = None
+
+    def loads(self, length: float) -> tuple[Load, ...]:
+        """The loads as torchrod.loads has them."""
+        point = self.width <= 0
+        c = 0.5 / self.width[~point] ** 2
+        spread = (math.pi / c).sqrt() * on_rod_fraction(self.location[~point], c, length)
+        force = torch.cat([self.force, torch.zeros_like(self.force[:, :1])], -1)
+        smooth = GaussianLoads(self.force[~point] / spread.unsqueeze(-1), self.location[~point], c)
+        return (smooth, PointForces(force[point], self.location[point]))
 
 
 def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B K 4 4"]:

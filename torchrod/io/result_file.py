@@ -2,14 +2,14 @@
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ..errors import InputError
-from ..result import Estimate
+from ..result import Estimate, Fit
 from ..status import Status
 
 
@@ -33,6 +33,7 @@ def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
             },
         }
         for k in range(len(force))
+        if not math.isnan(force[k][0])
     ]
 
 
@@ -68,20 +69,12 @@ def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot
     if path.suffix != ".npz":
         raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
-    np.savez_compressed(path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None})
+    np.savez_compressed(
+        path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}
+    )
 
 
-@dataclass(frozen=True)
-class FittedLoads:
-    """What a figure needs of one sample of a result file: loads in the section frame (N, m), their spread, and the base wrench."""
-
-    force: torch.Tensor
-    location: torch.Tensor
-    width: torch.Tensor
-    base_wrench: torch.Tensor
-
-
-def read_fit(path: str | Path, sample: str) -> FittedLoads:
+def read_fit(path: str | Path, sample: str) -> Fit:
     """One sample of a RESULT.json or RESULT.npz. Errors: InputError naming file, sample and remedy."""
     path = Path(path)
     if not path.is_file():
@@ -91,7 +84,7 @@ def read_fit(path: str | Path, sample: str) -> FittedLoads:
             with np.load(path, allow_pickle=False) as file:
                 names = [str(n) for n in file["sample"]]
                 b = names.index(sample)
-                values = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
+                values = [file[key][b] for key in ("force", "location", "width", "base_wrench", "registration") if key in file]
         else:
             results = json.loads(path.read_text(encoding="utf-8"))["results"]
             names = [str(r["sample"]) for r in results]
@@ -99,9 +92,15 @@ def read_fit(path: str | Path, sample: str) -> FittedLoads:
             loads, wrench = record["loads"], record["base_wrench"]
             values = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
             values.append([*wrench["force_N"], *wrench["moment_Nm"]])
+            if "registration" in record:
+                values.append([*record["registration"]["translation_m"], *record["registration"]["rotation_rad"]])
     except (KeyError, TypeError, OSError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: is not a result of torchrod estimate ({error}); write it with --out") from None
     except ValueError:
         raise InputError(f"{path}: has no sample {sample}; choose one of those estimated with --sample") from None
     tensors = [torch.tensor(np.array(v, dtype=float)) for v in values]
-    return FittedLoads(tensors[0].reshape(-1, 2), *tensors[1:])
+    there = torch.isfinite(tensors[0].reshape(-1, 2)).all(-1)
+    tensors[:3] = [tensors[0].reshape(-1, 2)[there], tensors[1][there], tensors[2][there]]
+    if not all(bool(torch.isfinite(t).all()) for t in tensors):
+        raise InputError(f"{path}: sample {sample} has no fit to draw; see its message")
+    return Fit(*tensors)

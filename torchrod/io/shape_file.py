@@ -40,7 +40,9 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; s is in metres")
     reach = markers.positions.norm(dim=-1).nanmedian() / L
     if reach > REACH:
-        raise InputError(f"{path}: positions lie {float(reach):.3g} rod lengths from the base; give metres in the robot's base frame")
+        raise InputError(
+            f"{path}: positions lie {float(reach):.3g} rod lengths from the base; give metres in the robot's base frame"
+        )
     T = len(robot.tendons)
     if T and markers.tension is None:
         raise InputError(f"{path}: tensions are missing; the robot has {T} tendons, add tension_1..tension_{T} (N)")
@@ -54,7 +56,9 @@ def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: s
     """s must increase; markers at one arc length are told apart by their offsets only."""
     for i in range(len(s) - 1):
         if s[i + 1] < s[i] or (s[i + 1] == s[i] and (offsets is None or np.array_equal(offsets[i], offsets[i + 1]))):
-            raise InputError(f"{path}: sample {sample}: s = {s[i + 1]:g} m follows {s[i]:g} m; sort the markers so that s increases")
+            raise InputError(
+                f"{path}: sample {sample}: s = {s[i + 1]:g} m follows {s[i]:g} m; sort the markers so that s increases"
+            )
 
 
 def _read_npz(path: Path) -> Shapes:
@@ -62,7 +66,9 @@ def _read_npz(path: Path) -> Shapes:
         with np.load(path, allow_pickle=False) as file:
             data = {key: np.asarray(file[key]) for key in file.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: is not an NPZ of plain numbers ({str(error).splitlines()[0]}); save numeric arrays only") from None
+        raise InputError(
+            f"{path}: is not an NPZ of plain numbers ({str(error).splitlines()[0]}); save numeric arrays only"
+        ) from None
     for key in ("s", "positions"):
         if key not in data:
             raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
@@ -97,7 +103,9 @@ def _read_csv(path: Path) -> Shapes:
     samples: dict[str, list[dict[str, float]]] = {}
     for number, row in enumerate(rows[1:], start=2):
         if len(row) != len(header):
-            raise InputError(f"{path}: line {number} has {len(row)} cells, the header {len(header)}; leave a missing marker's cells empty")
+            raise InputError(
+                f"{path}: line {number} has {len(row)} cells, the header {len(header)}; leave a missing marker's cells empty"
+            )
         cells = dict(zip(header, row, strict=True))
         name = cells.pop("sample", "0").strip()
         samples.setdefault(name, []).append({key: _cell(path, number, key, text) for key, text in cells.items()})
@@ -112,7 +120,9 @@ def _check_header(path: Path, header: list[str]) -> None:
             raise InputError(f"{path}: column '{name}' is missing; the header starts with s,x,y,z")
     for name in header:
         if name not in known or header.count(name) > 1:
-            raise InputError(f"{path}: unexpected column '{name}'; known: s,x,y,z,sample,rx,ry,rz and tension_1..tension_T, once each")
+            raise InputError(
+                f"{path}: unexpected column '{name}'; known: s,x,y,z,sample,rx,ry,rz and tension_1..tension_T, once each"
+            )
     if 0 < sum(name in header for name in OFFSETS) < 3:
         raise InputError(f"{path}: rx,ry,rz come together; add the missing one of them")
 
@@ -124,7 +134,9 @@ def _cell(path: Path, line: int, key: str, text: str) -> float:
     except ValueError:
         raise InputError(f"{path}: line {line}, column {key}: {text.strip()!r} is not a number") from None
     if not math.isfinite(value) and (key not in "xyz" or math.isinf(value)):
-        raise InputError(f"{path}: line {line}, column {key}: must be a finite number; only x, y, z may be empty (a missing marker)")
+        raise InputError(
+            f"{path}: line {line}, column {key}: must be a finite number; only x, y, z may be empty (a missing marker)"
+        )
     return value
 
 
@@ -146,7 +158,9 @@ def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, f
             positions[b, index[tuple(row[k] for k in keys)]] = torch.tensor([row[k] for k in "xyz"], dtype=torch.float64)
     table = torch.tensor(places, dtype=torch.float64)
     tension = torch.tensor([[rows[0][t] for t in tensions] for rows in samples.values()], dtype=torch.float64) if tensions else None
-    return Shapes(Markers(table[:, 0].contiguous(), positions, table[:, 1:].contiguous() if has_offsets else None, tension), list(samples))
+    return Shapes(
+        Markers(table[:, 0].contiguous(), positions, table[:, 1:].contiguous() if has_offsets else None, tension), list(samples)
+    )
 
 
 def write_shapes(path: str | Path, shapes: Shapes) -> None:

@@ -1,0 +1,110 @@
+"""The command line. Nothing heavy is imported until a command runs, so that --help answers at once."""
+
+import sys
+import warnings
+from typing import NoReturn
+
+from jsonargparse import ArgumentParser, Namespace
+
+from .errors import InputError
+
+
+class _Parser(ArgumentParser):
+    """Bad arguments are bad input: one line, exit status 2."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        raise InputError(f"{' '.join(str(message).split())} (see torchrod --help)") from ex
+
+
+def _number_list(parser: ArgumentParser, name: str, help: str, count: int | str = "+") -> None:
+    parser.add_argument(name, type=float, nargs=count, help=help)
+
+
+def _estimate_parser() -> ArgumentParser:
+    parser = _Parser(
+        description="Estimate where, which way and how hard a robot is pushed, from the measured positions of its markers."
+    )
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz: marker positions (m), base frame")
+    parser.add_argument("--contacts", type=str, default="1", help="number of loads, or auto: as many as the data ask for")
+    parser.add_argument(
+        "--load-prior",
+        type=str,
+        choices=["point", "contact", "distributed", "none"],
+        default="contact",
+        help="what is known of the width",
+    )
+    parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
+    parser.add_argument(
+        "--warm-start", type=str, choices=["auto", "off"], default="auto", help="auto: a learned start where one fits"
+    )
+    parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
+    _number_list(parser, "--location", "known locations of the loads (m), one per load")
+    parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
+    parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
+    parser.add_argument("--steps", type=int, default=40, help="least number of arc-length steps")
+    parser.add_argument("--max-iterations", type=int, default=100, help="give a sample up after this many")
+    return parser
+
+
+def _simulate_parser() -> ArgumentParser:
+    parser = _Parser(description="The shape of a robot under known loads, as marker positions.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument(
+        "--point",
+        nargs=3,
+        action="append",
+        metavar=("S", "FX", "FY"),
+        help="a point force at S (m) of FX FY (N, section frame); repeatable",
+    )
+    _number_list(parser, "--tip-force", "X Y Z (N, base frame)", 3)
+    _number_list(parser, "--tip-moment", "X Y Z (N m, base frame)", 3)
+    _number_list(parser, "--tension", "tensions T1 T2 ... (N)")
+    parser.add_argument("--markers", type=int, default=20, help="number of markers, evenly spaced, the last at the tip")
+    _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
+    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to every coordinate (m)")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--out", type=str, required=True, help="SHAPE.csv")
+    return parser
+
+
+def _plot_parser() -> ArgumentParser:
+    parser = _Parser(description="Draw one sample of an estimate.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument("shapes", type=str, help="the shapes that were estimated")
+    parser.add_argument("result", type=str, help="RESULT.json or .npz of torchrod estimate")
+    parser.add_argument("--sample", type=str, default=None, help="which sample; the first by default")
+    parser.add_argument("--out", type=str, required=True, help="FIGURE.png")
+    return parser
+
+
+def _parser() -> ArgumentParser:
+    parser = _Parser(prog="torchrod", description="Forces from shape: the loads on a continuum robot from its measured markers.")
+    commands = parser.add_subcommands(required=True)
+    commands.add_subcommand("estimate", _estimate_parser(), help="loads from marker positions")
+    commands.add_subcommand("simulate", _simulate_parser(), help="marker positions from known loads")
+    commands.add_subcommand("plot", _plot_parser(), help="a figure of an estimate")
+    return parser
+
+
+def _run(options: Namespace) -> None:
+    from . import commands
+
+    getattr(commands, options.subcommand)(options[options.subcommand])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command `torchrod`. Exit status 0 when it did its work, 2 with one line on stderr for bad input."""
+
+    def one_line(message: Warning | str, *_: object) -> None:
+        print(f"torchrod: warning: {message}", file=sys.stderr)  # noqa: T201
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = one_line
+            _run(_parser().parse_args(arguments))
+    except InputError as error:
+        print(f"torchrod: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    return 0

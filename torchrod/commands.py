@@ -1,0 +1,184 @@
+"""What each command does, once its arguments are known."""
+
+import math
+from pathlib import Path
+
+import torch
+from jsonargparse import Namespace
+from tqdm import tqdm
+
+from .coordinates import GaussianCoordinates
+from .errors import InputError
+from .estimate import Settings
+from .estimate import estimate as run_estimate
+from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
+from .io.result_file import read_fit
+from .loads import Load, PointForces, PointWrenches
+from .measurement import Markers, Model
+from .result import Estimate
+from .robot import Robot
+from .rod import DTYPE
+from .selection import select_count
+from .statics import solve_shape
+from .status import Status
+
+MAX_CONTACTS = 3
+
+
+def _positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name} is {value}; it must be a positive number")
+
+
+def _writable(*paths: str | None) -> None:
+    """Refuse before the work, not after it."""
+    for path in paths:
+        if path is not None and not Path(path).resolve().parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist; create it first")
+
+
+def _count(options: Namespace, robot: Robot) -> int | None:
+    """How many loads; None for auto."""
+    L = robot.rod.length
+    if options.location:
+        if options.contacts not in ("1", str(len(options.location))):
+            raise InputError(f"--contacts {options.contacts} but {len(options.location)} locations; give one --location per load")
+        if not all(0 < s <= L for s in options.location):
+            raise InputError(f"--location {options.location}: must lie on the rod, above 0 and up to {L} m")
+        return len(options.location)
+    if options.contacts == "auto":
+        return None
+    if not options.contacts.isdecimal() or int(options.contacts) > 10:
+        raise InputError(f"--contacts is {options.contacts!r}; it must be auto or a number from 0 to 10")
+    return int(options.contacts)
+
+
+def estimate(options: Namespace) -> None:
+    """torchrod estimate."""
+    robot = read_robot(options.robot)
+    shapes = read_shapes(options.shapes, robot)
+    _positive("--noise", options.noise)
+    _positive("--steps", options.steps)
+    _positive("--max-iterations", options.max_iterations)
+    _writable(options.out, options.plot)
+    count = _count(options, robot)
+    rod, locations = robot.rod, tuple(options.location) if options.location else None
+
+    def model(k: int) -> Model:
+        coordinates = GaussianCoordinates(k, rod.length, rod.force_scale, options.load_prior, locations)
+        return Model(robot, coordinates, options.registration, steps=options.steps)
+
+    settings = Settings(max_iterations=options.max_iterations)
+    try:
+        if count is None:
+            result = select_count([model(k) for k in range(MAX_CONTACTS + 1)], shapes.markers, options.noise, settings, _bar)
+        else:
+            with _bar(len(shapes.samples), f"{count} contact{'s' * (count != 1)}") as bar:
+                result = run_estimate(model(count), shapes.markers, options.noise, settings, progress=bar.update)
+    except ValueError as error:
+        raise InputError(f"{options.shapes}: {error}") from None
+    print(_report(result, shapes.samples))  # noqa: T201
+    if options.out:
+        write_result(options.out, result, shapes.samples, robot.name)
+    if options.plot:
+        _draw(options.plot, robot, shapes.markers, result, shapes.samples)
+
+
+def _bar(total: int, what: str) -> tqdm:
+    """A progress bar on stderr, shown where there is more than a second of work."""
+    return tqdm(total=total, desc=what, unit="sample", delay=1.0, leave=False, dynamic_ncols=True)
+
+
+def _report(result: Estimate, samples: list[str]) -> str:
+    """The table on the screen: one line per load."""
+    lines = [
+        f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{'force (N)':>20}{'F_x (N)':>10}{'F_y (N)':>10}{'location (mm)':>20}{'rms (mm)':>10}"
+    ]
+    notes = []
+    for b, name in enumerate(samples):
+        status = Status(int(result.status[b])).label
+        ok = "yes" if result.accepted[b] else "no"
+        rms = float(result.rms_residual[b]) * 1e3
+        present = [k for k in range(result.force.shape[1]) if status == "invalid" or not math.isnan(float(result.force[b, k, 0]))]
+        for k in present or [None]:
+            head = f"{name:>8}  {status:<13} {ok:<4}" if k in (0, None) else " " * 28
+            if k is None:
+                lines.append(f"{head}{'-':>4}{'no load':>20}{'':>40}{rms:>10.3f}")
+                continue
+            force = f"{float(result.magnitude[b, k]):.4f} +- {float(result.magnitude_std[b, k]):.4f}"
+            place = f"{float(result.location[b, k]) * 1e3:.1f} +- {float(result.location_std[b, k]) * 1e3:.1f}"
+            fx, fy = result.force[b, k].tolist()
+            lines.append(f"{head}{k + 1:>4}{force:>20}{fx:>10.4f}{fy:>10.4f}{place:>20}{rms:>10.3f}")
+        if not result.accepted[b]:
+            notes.append(f"sample {name}: {result.message(b)}")
+    return "\n".join([*lines, *notes])
+
+
+def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: list[str]) -> None:
+    from .plot import draw
+
+    drawable = torch.isfinite(result.base_wrench).all(-1).nonzero().flatten().tolist()
+    if not drawable:
+        raise InputError(f"{path}: no sample has a fit to draw; see the messages above")
+    b = drawable[0]
+    draw(path, robot, result.fit(b), markers, b, f"{robot.name}, sample {samples[b]}: {result.message(b)}")
+
+
+def simulate(options: Namespace) -> None:
+    """torchrod simulate."""
+    robot = read_robot(options.robot)
+    L, T = robot.rod.length, len(robot.tendons)
+    if options.at is None and not 1 <= options.markers <= 10_000:
+        raise InputError(f"--markers is {options.markers}; it must be from 1 to 10000")
+    at = options.at if options.at is not None else [L * (i + 1) / options.markers for i in range(options.markers)]
+    if any(not 0 <= s <= L for s in at) or any(b <= a for a, b in zip(at, at[1:], strict=False)):
+        raise InputError(f"--at {at}: must increase and lie on the rod, 0 to {L} m")
+    tension = options.tension or []
+    if len(tension) != T or any(not (math.isfinite(t) and t >= 0) for t in tension):
+        raise InputError(f"--tension {tension}: the robot has {T} tendons; give {T} tensions of at least 0 N")
+    if not (math.isfinite(options.noise) and options.noise >= 0):
+        raise InputError(f"--noise is {options.noise}; it must be at least 0")
+    _writable(options.out)
+    s = torch.tensor(at, dtype=DTYPE)
+    tensions = torch.tensor([tension], dtype=DTYPE) if T else None
+    shape = solve_shape(robot, _known_loads(options, L), tensions, s, 1)
+    status = Status(int(shape.status[0]))
+    if status is not Status.CONVERGED:
+        raise InputError(f"{options.robot}: no equilibrium was found under these loads; check their size and units")
+    noise = options.noise * torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(options.seed), dtype=DTYPE)
+    write_shapes(options.out, Shapes(Markers(s, shape.p + noise, None, tensions), ["0"]))
+    tip = [f"{v * 1e3:.2f}" for v in shape.p[0, -1].tolist()]
+    print(f"{options.out}: {len(at)} markers, the last at ({', '.join(tip)}) mm")  # noqa: T201
+
+
+def _known_loads(options: Namespace, L: float) -> tuple[Load, ...]:
+    loads: list[Load] = []
+    if options.point:
+        try:
+            rows = torch.tensor([[float(v) for v in row] for row in options.point], dtype=DTYPE)
+        except ValueError as error:
+            raise InputError(f"--point takes three numbers, S FX FY: {error}") from None
+        if not bool(torch.isfinite(rows).all()) or bool(((rows[:, 0] < 0) | (rows[:, 0] > L)).any()):
+            raise InputError(f"--point {options.point}: S must lie on the rod, 0 to {L} m, and the force be finite")
+        force = torch.cat([rows[:, 1:], torch.zeros_like(rows[:, :1])], -1)
+        loads.append(PointForces(force.unsqueeze(0), rows[:, 0].unsqueeze(0)))
+    if options.tip_force or options.tip_moment:
+        wrench = torch.tensor([options.tip_force or [0.0] * 3, options.tip_moment or [0.0] * 3], dtype=DTYPE)
+        if not bool(torch.isfinite(wrench).all()):
+            raise InputError("--tip-force and --tip-moment must be finite")
+        loads.append(PointWrenches(wrench[:1].unsqueeze(0), wrench[1:].unsqueeze(0), torch.tensor([L], dtype=DTYPE)))
+    return tuple(loads)
+
+
+def plot(options: Namespace) -> None:
+    """torchrod plot."""
+    from .plot import draw
+
+    robot = read_robot(options.robot)
+    shapes = read_shapes(options.shapes, robot)
+    sample = options.sample or shapes.samples[0]
+    if sample not in shapes.samples:
+        raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
+    _writable(options.out)
+    fit = read_fit(options.result, sample)
+    draw(options.out, robot, fit, shapes.markers, shapes.samples.index(sample), f"{robot.name}, sample {sample}")
