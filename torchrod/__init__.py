@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .errors import InputError
-    from .estimate import Settings, cold_start, estimate, paper_settings
+    from .estimator import Settings, cold_start, estimate, paper_settings
     from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "errors": ("InputError",),
-    "estimate": ("Settings", "cold_start", "estimate", "paper_settings"),
+    "estimator": ("Settings", "cold_start", "estimate", "paper_settings"),
     "io": ("Shapes", "read_robot", "read_shapes", "write_result", "write_shapes"),
     "jacobian": ("forward_jacobian",),
     "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),

@@ -1,6 +1,7 @@
 """What each command does, once its arguments are known."""
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -9,8 +10,8 @@ from tqdm import tqdm
 
 from .coordinates import GaussianCoordinates
 from .errors import InputError
-from .estimate import Settings
-from .estimate import estimate as run_estimate
+from .estimator import Settings
+from .estimator import estimate as run_estimate
 from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
 from .io.result_file import read_fit
 from .loads import Load, PointForces, PointWrenches
@@ -91,9 +92,8 @@ def _bar(total: int, what: str) -> tqdm:
 
 def _report(result: Estimate, samples: list[str]) -> str:
     """The table on the screen: one line per load."""
-    lines = [
-        f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{'force (N)':>20}{'F_x (N)':>10}{'F_y (N)':>10}{'location (mm)':>20}{'rms (mm)':>10}"
-    ]
+    columns = f"{'force (N)':>20}{'F_x (N)':>10}{'F_y (N)':>10}{'location (mm)':>20}{'rms (mm)':>10}"
+    lines = [f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{columns}"]
     notes = []
     for b, name in enumerate(samples):
         status = Status(int(result.status[b])).label
@@ -131,7 +131,7 @@ def simulate(options: Namespace) -> None:
     if options.at is None and not 1 <= options.markers <= 10_000:
         raise InputError(f"--markers is {options.markers}; it must be from 1 to 10000")
     at = options.at if options.at is not None else [L * (i + 1) / options.markers for i in range(options.markers)]
-    if any(not 0 <= s <= L for s in at) or any(b <= a for a, b in zip(at, at[1:], strict=False)):
+    if any(not 0 <= s <= L for s in at) or any(b <= a for a, b in pairwise(at)):
         raise InputError(f"--at {at}: must increase and lie on the rod, 0 to {L} m")
     tension = options.tension or []
     if len(tension) != T or any(not (math.isfinite(t) and t >= 0) for t in tension):

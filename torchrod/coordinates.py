@@ -6,7 +6,7 @@ start, a Gaussian prior (mean and precision per entry; precision 0 for none) and
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -37,6 +37,7 @@ class LoadReport:
     net_force: Float[Tensor, "... K 2"]
 
 
+@runtime_checkable
 class LoadCoordinates(Protocol):
     """What every parameterization supplies."""
 

@@ -81,7 +81,7 @@ def decrement(A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> Float[Tenso
     return (g * solve_spd(A, g.unsqueeze(-1)).squeeze(-1)).sum(-1)
 
 
-def adapted_weights(w: Float[Tensor, "B z"], markers: int, decrement: Float[Tensor, "B"]) -> Float[Tensor, "B z"]:
+def adapted_weights(w: Float[Tensor, "B z"], markers: int, decrement: Float[Tensor, " B"]) -> Float[Tensor, "B z"]:
     """Residual-adaptive noise: R = sigma^2 (1 + decrement / m) on the m seen of the first `markers` entries of z.
 
     The decrement is the part of r^T W r that a Gauss-Newton step promises to remove. Far from the data it is nearly all of it,

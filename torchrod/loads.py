@@ -11,7 +11,7 @@ SI units. Source: the paper's (9)-(13); DESIGN.md section 2.
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -45,6 +45,7 @@ class LoadIntegrals:
         )
 
 
+@runtime_checkable
 class Load(Protocol):
     """What a load family must supply."""
 

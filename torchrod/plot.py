@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
@@ -94,7 +95,7 @@ def _look_across(axes: Axes3D, vectors: Float[Tensor, "n 3"]) -> None:
 
 
 def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int, title: str) -> None:
-    """Write the figure of one sample: markers (teal), fitted rod (dark), load density and net forces (red), equal axes in metres."""
+    """Write the figure of one sample: markers (teal), fitted rod (dark), loads (red); equal axes in metres."""
     scene = _scene(robot, fit, None if markers.tension is None else markers.tension[sample])
     seen = markers.positions[sample][markers.present[sample]]
     figure = Figure(figsize=(8, 7), layout="constrained")
@@ -109,6 +110,7 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
         axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, label="load per length")
         for i in scene.loaded.nonzero().flatten().tolist():
             axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5)
+    labels: list[tuple[list[float], list[float], str]] = []
     for k, (head, tail) in enumerate(zip(scene.points, scene.tails, strict=True)):
         axes.quiver(
             *tail.tolist(),
@@ -118,12 +120,15 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
             arrow_length_ratio=0.18,
             label="net force" if k == 0 else None,
         )
-        text = f"  {float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
-        axes.text(*tail.tolist(), text, color=LOAD, fontsize=11, fontweight="bold")
+        text = f" {float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
+        labels.append((tail.tolist(), head.tolist(), text))
     axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, label="clamp")
     everything = torch.cat([scene.line, seen, scene.tails, scene.envelope])
     _equal_axes(axes, everything)
     _look_across(axes, torch.cat([scene.line[-1:] - scene.line[:1], scene.points - scene.tails]))
     axes.set_title(textwrap.fill(title, 80), fontsize=12)
-    axes.legend(loc="upper left", frameon=False)
+    for tail, head, text in labels:
+        outward = proj3d.proj_transform(*tail, axes.get_proj())[0] >= proj3d.proj_transform(*head, axes.get_proj())[0]
+        axes.text(*tail, text, color=LOAD, fontsize=11, fontweight="bold", ha="left" if outward else "right")
+    figure.legend(loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(path, dpi=150)

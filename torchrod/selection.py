@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .estimate import Settings, estimate
+from .estimator import Settings, estimate
 from .measurement import Markers, Model
 from .result import Estimate
 from .status import Status

@@ -21,6 +21,7 @@ from .status import Status
 from .step import STATE_PARTS, Section, StageTable, State, rk4_step, section_wrench
 
 ORIENTATION_TOLERANCE = 1e-11  # rad: the forward solve's residual, far below what RK4 leaves
+INCREMENT_TOLERANCE = 1e-3  # rad: enough on the way to the full load
 MAX_NEWTON = 40
 LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put on in increments, to stay on the principal branch
 
@@ -166,6 +167,7 @@ def _newton(
 ) -> tuple[Quaternion, Float[Tensor, " B"], Int[Tensor, " B"]]:
     """Damped Newton on the tip's orientation: the best orientation, its residual (rad) and the iterations taken."""
     best = torch.full_like(fraction, torch.inf)
+    tolerance = torch.where(fraction < 1, INCREMENT_TOLERANCE, ORIENTATION_TOLERANCE)
     anchor, turn, damping = q, torch.zeros_like(q[..., :3]), torch.ones_like(best)
     iterations = torch.zeros(best.shape, dtype=torch.int64)
     for _ in range(MAX_NEWTON):
@@ -174,7 +176,7 @@ def _newton(
         better = size < best
         anchor, turn = torch.where(better.unsqueeze(-1), q, anchor), torch.where(better.unsqueeze(-1), step, turn)
         best, damping = torch.where(better, size, best), torch.where(better, 1.0, 0.5 * damping)
-        active = (best > ORIENTATION_TOLERANCE) & torch.isfinite(best) & (damping > 1e-3)
+        active = (best > tolerance) & torch.isfinite(best) & (damping > 1e-3)
         iterations = iterations + active
         if not active.any():
             break

@@ -3,6 +3,7 @@
 import math
 import tomllib
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def _rows(where: str, value: object, count: int) -> list[list[float]]:
     if not isinstance(value, list) or not value:
         raise InputError(f"{where} must be a list of rows of {count} numbers, s first")
     rows = [_numbers(f"{where}[{i}]", row, count) for i, row in enumerate(value)]
-    if any(b[0] <= a[0] for a, b in zip(rows, rows[1:], strict=False)):
+    if any(b[0] <= a[0] for a, b in pairwise(rows)):
         raise InputError(f"{where}: s must increase from row to row")
     return rows
 
@@ -90,7 +91,8 @@ def _rod(path: Path, table: dict[str, Any]) -> Rod:
         for key in ("K_se", "K_bt"):
             if key not in table:
                 raise InputError(f"{where}.{key} is missing; K_se and K_bt are given together")
-        return Rod.from_stiffness(length, *(_stiffness(f"{where}.{k}", table[k]) for k in ("K_se", "K_bt")), mass, rows)
+        K_se, K_bt = (_stiffness(f"{where}.{k}", table[k]) for k in ("K_se", "K_bt"))
+        return Rod.from_stiffness(length, K_se, K_bt, mass, rows)
     for key in ("diameter", "youngs_modulus", "shear_modulus"):
         if key not in table:
             raise InputError(f"{where}.{key} is missing; give diameter, youngs_modulus and shear_modulus, or K_se and K_bt")
@@ -108,7 +110,8 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
     if ends_at > length * (1 + 1e-9):
         raise InputError(f"{where}.ends_at is {ends_at} m, beyond the rod's length of {length} m")
     if "offset" in table:
-        return Tendon.straight(*_numbers(f"{where}.offset", table["offset"], 2), ends_at)
+        x, y = _numbers(f"{where}.offset", table["offset"], 2)
+        return Tendon.straight(x, y, ends_at)
     return Tendon(tuple((s, x, y) for s, x, y in _rows(f"{where}.routing", table["routing"], 3)), ends_at)
 
 

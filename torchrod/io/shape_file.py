@@ -27,7 +27,7 @@ class Shapes:
 
 
 def read_shapes(path: str | Path, robot: Robot) -> Shapes:
-    """Markers from a CSV or NPZ file (docs/files.md), checked against the robot. Errors: InputError naming file, place and remedy."""
+    """Markers from a CSV or NPZ file (docs/files.md), checked against the robot. Errors: InputError naming file and remedy."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; check the path")

@@ -17,7 +17,8 @@ from .statics import solve_shape
 from .status import Status
 
 CHUNK = 256  # samples per pass: the working set of one iteration stays in cache
-DECREMENT = 1e-3  # converged: a further step would lower the cost (chi^2) by less than this
+DECREMENT = 1e-3  # converged: a further step promises to lower the cost (chi^2) by less than this,
+DECREMENT_SHARE = 1e-6  # or by less than this share of it: a model that cannot explain the data need not be fitted to round-off
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x:
         at = linearize(model, x[live], here, wl)
         iterations[live] += 1
         finite = torch.isfinite(at.cost) & torch.isfinite(at.A).flatten(1).all(-1)
-        done = (at.decrement < DECREMENT) & finite
+        done = (at.decrement < (DECREMENT_SHARE * at.cost).clamp(min=DECREMENT)) & finite
         status[live[done]] = int(Status.CONVERGED)
 
         A, g = at.A, at.g
