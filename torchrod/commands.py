@@ -13,7 +13,7 @@ from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
 from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
-from .io.result_file import read_fit
+from .io.result_file import check_suffix, read_fit
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers, Model
 from .result import Estimate
@@ -31,9 +31,9 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name} is {value}; it must be a positive number")
 
 
-def _writable(*paths: str | None) -> None:
-    """Refuse before the work, not after it."""
-    for path in paths:
+def _writable(out: str | None, figure: str | None = None) -> None:
+    """Refuse before the work, not after it. A name that the writers would refuse is refused here."""
+    for path in (out, figure):
         if path is not None and not Path(path).resolve().parent.is_dir():
             raise InputError(f"{path}: its folder does not exist; create it first")
 
@@ -62,6 +62,8 @@ def estimate(options: Namespace) -> None:
     _positive("--steps", options.steps)
     _positive("--max-iterations", options.max_iterations)
     _writable(options.out, options.plot)
+    if options.out:
+        check_suffix(options.out)
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 

@@ -81,13 +81,16 @@ def decrement(A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> Float[Tenso
     return (g * solve_spd(A, g.unsqueeze(-1)).squeeze(-1)).sum(-1)
 
 
-def adapted_weights(w: Float[Tensor, "B z"], markers: int, decrement: Float[Tensor, " B"]) -> Float[Tensor, "B z"]:
-    """Residual-adaptive noise: R = sigma^2 (1 + decrement / m) on the m seen of the first `markers` entries of z.
+def inflation(w: Float[Tensor, "B z"], markers: int, decrement: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
+    """decrement / m, with m the number of marker coordinates seen: what a Gauss-Newton step promises to remove from each."""
+    return decrement / (w[:, :markers] > 0).sum(-1).clamp(min=1)
 
-    The decrement is the part of r^T W r that a Gauss-Newton step promises to remove. Far from the data it is nearly all of it,
-    and R is sigma^2 + mean(r^2); at a minimum it vanishes and the weights are the true ones, whether or not the model explains
-    the data there (with the whole of mean(r^2) a poor fit would never be stationary). The tip residual keeps its weight: the
-    first iterations look for an equilibrium that bends the right way rather than for a rod through all the markers.
+
+def adapted_weights(w: Float[Tensor, "B z"], markers: int, inflated: Float[Tensor, " B"]) -> Float[Tensor, "B z"]:
+    """Residual-adaptive noise: R = sigma^2 (1 + inflated) on the first `markers` entries of z.
+
+    With inflated = decrement / m, R is sigma^2 + mean(r^2) far from the data, where nearly all of r^T W r can be removed, and the
+    true sigma^2 at a minimum, whether or not the model explains the data there. The tip residual keeps its weight: the first
+    iterations look for an equilibrium that bends the right way rather than for a rod through all the markers.
     """
-    seen = (w[:, :markers] > 0).sum(-1).clamp(min=1)
-    return torch.cat([w[:, :markers] / (1 + decrement / seen).unsqueeze(-1), w[:, markers:]], -1)
+    return torch.cat([w[:, :markers] / (1 + inflated).unsqueeze(-1), w[:, markers:]], -1)

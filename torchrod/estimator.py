@@ -19,6 +19,7 @@ from .status import Status
 CHUNK = 256  # samples per pass: the working set of one iteration stays in cache
 DECREMENT = 1e-3  # converged: a further step promises to lower the cost (chi^2) by less than this,
 DECREMENT_SHARE = 1e-6  # or by less than this share of it: a model that cannot explain the data need not be fitted to round-off
+SETTLED = 1.0  # the cost with adapted weights is at its minimum when a step promises less than this
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,14 @@ class Settings:
 
 
 def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
-    """The paper's plain recursion: no step limit, no adaptive noise. Q and Sigma0 multiply the squared sizes of its parameters."""
+    """The paper's plain recursion: no step limit, no adaptive noise.
+
+    Q and Sigma0 multiply the squared sizes of [a_x, a_y, eta, c] and of alpha and zeta. The paper does not print its own; these
+    sizes did best of those tried on Study 1 (docs/model.md).
+    """
     assert isinstance(model.coordinates, PaperCoordinates)
-    size = torch.tensor([10.0, 10.0, 1.0, 500.0], dtype=DTYPE).repeat(model.coordinates.count)
-    size = torch.cat([size, torch.full((model.size - len(size),), 0.1, dtype=DTYPE)])
+    size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
+    size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
     return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, 500)
 
 
@@ -99,6 +104,7 @@ def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x:
     status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
     iterations = torch.zeros(B, dtype=torch.int64)
     x, before, Sigma = x.clone(), x.clone(), Sigma0.expand(B, -1, -1).clone()
+    cap, P3 = x.new_full((B,), torch.inf if settings.adaptive else 0.0), 3 * len(markers.s)
     live = ok.nonzero().squeeze(-1)
     for _ in range(settings.max_iterations):
         if not len(live):
@@ -110,10 +116,12 @@ def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x:
         done = (at.decrement < (DECREMENT_SHARE * at.cost).clamp(min=DECREMENT)) & finite
         status[live[done]] = int(Status.CONVERGED)
 
-        A, g = at.A, at.g
-        if settings.adaptive:
-            A, g = ekf.information(at.H, at.r, ekf.adapted_weights(wl, 3 * len(markers.s), at.decrement), x[live], mean, precision)
+        inflated = torch.minimum(ekf.inflation(wl, P3, at.decrement), cap[live])
+        A, g = ekf.information(at.H, at.r, ekf.adapted_weights(wl, P3, inflated), x[live], mean, precision)
         step, Sigma_next = ekf.update(ekf.predict(Sigma[live], Q), A, g)
+        # Where the adapted problem has settled but the true one has not, the weights must move on towards the true ones.
+        settled = (g * step).sum(-1) < SETTLED
+        cap[live] = torch.where(settled, 0.1 * inflated, cap[live])
         fresh = torch.isfinite(Sigma_next).flatten(1).all(-1) & finite
         onward = x[live] + _limited(step, settings.step_limit)
         # A model that overflowed says nothing: go half way back to the last place where it did.

@@ -110,7 +110,7 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
         axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, label="load per length")
         for i in scene.loaded.nonzero().flatten().tolist():
             axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5)
-    labels: list[tuple[list[float], list[float], str]] = []
+    labels: list[tuple[tuple[float, float, float], tuple[float, float, float], str]] = []
     for k, (head, tail) in enumerate(zip(scene.points, scene.tails, strict=True)):
         axes.quiver(
             *tail.tolist(),
@@ -121,14 +121,14 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
             label="net force" if k == 0 else None,
         )
         text = f" {float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
-        labels.append((tail.tolist(), head.tolist(), text))
+        labels.append((tuple(tail.tolist()), tuple(head.tolist()), text))
     axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, label="clamp")
     everything = torch.cat([scene.line, seen, scene.tails, scene.envelope])
     _equal_axes(axes, everything)
     _look_across(axes, torch.cat([scene.line[-1:] - scene.line[:1], scene.points - scene.tails]))
     axes.set_title(textwrap.fill(title, 80), fontsize=12)
     for tail, head, text in labels:
-        outward = proj3d.proj_transform(*tail, axes.get_proj())[0] >= proj3d.proj_transform(*head, axes.get_proj())[0]
-        axes.text(*tail, text, color=LOAD, fontsize=11, fontweight="bold", ha="left" if outward else "right")
+        (x, y, z), across = tail, [proj3d.proj_transform(*end, axes.get_proj())[0] for end in (tail, head)]
+        axes.text(x, y, z, text, color=LOAD, fontsize=11, fontweight="bold", ha="left" if across[0] >= across[1] else "right")
     figure.legend(loc="outside lower center", ncols=5, frameon=False)
     figure.savefig(path, dpi=150)

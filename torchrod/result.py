@@ -79,8 +79,8 @@ class Estimate:
         status = Status(int(self.status[sample]))
         if status is Status.CONVERGED and not self.accepted[sample]:
             return (
-                f"Converged, but chi2 = {float(self.chi2[sample]):.3g} for {int(self.dof[sample])} degrees of freedom: the model does "
-                "not explain the markers; allow more contacts, state more noise, or check tensions, gravity and registration."
+                f"Converged, but chi2 = {float(self.chi2[sample]):.3g} for {int(self.dof[sample])} degrees of freedom: the model "
+                "does not explain the markers; allow more contacts, state more noise, or check tensions, gravity and registration."
             )
         return status.message
 

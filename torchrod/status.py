@@ -23,6 +23,6 @@ class Status(IntEnum):
 
 _MESSAGES = {
     Status.CONVERGED: "Converged.",
-    Status.NOT_CONVERGED: "Did not converge: check units, marker order and tensions; then state more noise or allow more iterations.",
+    Status.NOT_CONVERGED: "Did not converge: check units, marker order and tensions; then state more noise or more iterations.",
     Status.INVALID: "Not enough finite numbers: give this sample more markers and finite tensions, or fewer unknown loads.",
 }

@@ -59,15 +59,20 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     return record
 
 
+def check_suffix(path: str | Path) -> None:
+    """InputError unless a result can be written under this name."""
+    if Path(path).suffix not in (".json", ".npz"):
+        raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
+
+
 def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot: str) -> None:
     """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix."""
     path = Path(path)
+    check_suffix(path)
     if path.suffix == ".json":
         content = {"robot": robot, "results": [result_record(estimate, b, name) for b, name in enumerate(samples)]}
         path.write_text(json.dumps(content, indent=1), encoding="utf-8")
         return
-    if path.suffix != ".npz":
-        raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     np.savez_compressed(
         path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}

@@ -1,0 +1,188 @@
+"""The command line as a user meets it: the reference shapes, the files, and what it says of bad input."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import reference
+from tests.robots import csv_of, toml_of
+from torchrod.cli import main
+
+CASES = {case["name"]: case for case in reference("shape")}
+ROD = toml_of(CASES["passive-point-0"]["robot"], "rod")
+TENDON = toml_of(CASES["onetendon-point-0"]["robot"], "tendon robot")
+STRAIGHT = "s,x,y,z\n" + "".join(f"{0.1 * i:g},0,0,{0.1 * i:g}\n" for i in range(1, 5))
+
+
+def run(folder: Path, robot: str, shapes: str, *options: str) -> dict:
+    (folder / "robot.toml").write_text(robot)
+    (folder / "shapes.csv").write_text(shapes)
+    out = folder / "result.json"
+    assert main(["estimate", str(folder / "robot.toml"), str(folder / "shapes.csv"), "--out", str(out), *options]) == 0
+    return json.loads(out.read_text())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_reference_shape(tmp_path, name):
+    """Shapes from an independent solver: single loads within 1 % and 1 mm, two within 2 % and 2 mm, Gaussians without a prior."""
+    case = CASES[name]
+    points = case["points"]
+    prior = "point" if points else "none"
+    options = ["--contacts", str(max(1, len(points))), "--noise", "1e-4", "--load-prior", prior]
+    result = run(tmp_path, toml_of(case["robot"], name), csv_of(case), *options)
+    assert result["robot"] == name
+    (sample,) = result["results"]
+    assert sample["status"] == "converged"
+    assert sample["accepted"] is True
+    truth = sorted((p["s"], math.hypot(p["fx"], p["fy"])) for p in points) or [(case["desc"]["mu"], case["desc"]["F"])]
+    loads = sorted(sample["loads"], key=lambda load: load["location_m"])
+    share, distance = (0.02, 2e-3) if len(points) != 1 else (0.01, 1e-3)
+    for (s, force), load in zip(truth, loads, strict=True):
+        size = load["magnitude_N"] if points else math.hypot(*load["net_force_local_N"])
+        assert abs(size / force - 1) < share
+        assert abs(load["location_m"] - s) < distance
+        if not points:
+            assert abs(load["width_m"] * math.sqrt(2 * case["desc"]["c"]) - 1) < 0.05
+    assert np.allclose(sample["base_wrench"]["force_N"], case["base_wrench"][:3], atol=0.02)
+
+
+def test_simulate_estimate_and_plot(tmp_path, capsys):
+    """The three commands in a row, and a figure that is a picture."""
+    robot, shape, result, figure = (str(tmp_path / n) for n in ("robot.toml", "shape.csv", "result.npz", "figure.png"))
+    Path(robot).write_text(ROD)
+    assert main(["simulate", robot, "--point", "0.25", "0.6", "-0.3", "--noise", "1e-4", "--seed", "3", "--out", shape]) == 0
+    again = Path(shape).read_text()
+    assert main(["simulate", robot, "--point", "0.25", "0.6", "-0.3", "--noise", "1e-4", "--seed", "3", "--out", shape]) == 0
+    assert Path(shape).read_text() == again
+    assert main(["estimate", robot, shape, "--noise", "1e-4", "--load-prior", "point", "--out", result, "--plot", figure]) == 0
+    assert "0.67" in capsys.readouterr().out
+    with np.load(result, allow_pickle=False) as arrays:
+        assert np.allclose(arrays["force"][0, 0], [0.6, -0.3], atol=0.01)
+    first = Path(figure).read_bytes()
+    assert first[:8] == b"\x89PNG\r\n\x1a\n"
+    assert main(["plot", robot, shape, result, "--out", figure]) == 0
+    assert len(Path(figure).read_bytes()) > 20_000
+
+
+def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
+    """Two samples in one file: each decides for itself, and a missing marker is an empty cell."""
+    pushed = CASES["passive-point-4"]
+    rows = ["sample,s,x,y,z"]
+    for i, (s, p) in enumerate(zip(pushed["s"], pushed["positions"], strict=True)):
+        rows.append(f"straight,{s!r},0,0,{s!r}" if i != 3 else f"straight,{s!r},,,")
+        rows.append(f"pushed,{s!r},{p[0]!r},{p[1]!r},{p[2]!r}")
+    result = run(tmp_path, ROD, "\n".join(rows), "--contacts", "auto", "--noise", "1e-3", "--steps", "20")
+    straight, bent = result["results"]
+    assert (straight["sample"], bent["sample"]) == ("straight", "pushed")
+    assert straight["loads"] == []
+    assert len(bent["loads"]) == 1
+    assert straight["accepted"]
+    assert bent["accepted"]
+
+
+def test_help_imports_neither_torch_nor_lightning():
+    code = "import sys; from torchrod.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code += "bad = {'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules); assert not bad, bad"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "estimate" in done.stdout
+
+
+def npz(path: Path, **arrays) -> None:
+    np.savez(path, **arrays)
+
+
+BAD = {
+    "missing robot": (None, STRAIGHT, [], "robot.toml: cannot be read"),
+    "missing shapes": (ROD, None, [], "shapes.csv: no such file"),
+    "not toml": ("length = = 3", STRAIGHT, [], "not valid TOML"),
+    "no rod": ("name = 'x'", STRAIGHT, [], "has no [rod] table"),
+    "unknown key": (ROD.replace("diameter", "diametre"), STRAIGHT, [], "unknown key 'diametre'"),
+    "missing key": (ROD.replace("diameter", "#"), STRAIGHT, [], "rod.diameter is missing"),
+    "negative number": (ROD.replace("diameter = ", "diameter = -"), STRAIGHT, [], "must be positive"),
+    "infinite number": (ROD.replace("youngs_modulus = 207000000000.0", "youngs_modulus = inf"), STRAIGHT, [], "must be finite"),
+    "text for a number": (ROD.replace("diameter = 0.0014", "diameter = 'thin'"), STRAIGHT, [], "must be a number"),
+    "bad gravity": (ROD + "gravity = [0, 9.81]\n", STRAIGHT, [], "a list of 3 numbers"),
+    "tendon past the tip": (TENDON.replace("ends_at = 0.4", "ends_at = 0.5"), STRAIGHT, [], "beyond the rod's length"),
+    "empty file": (ROD, "", [], "is empty"),
+    "header only": (ROD, "s,x,y,z\n", [], "no rows"),
+    "no z": (ROD, "s,x,y\n0.1,0,0\n", [], "column 'z' is missing"),
+    "odd column": (ROD, STRAIGHT.replace("s,x,y,z", "s,x,y,z,w"), [], "unexpected column 'w'"),
+    "text in a cell": (ROD, STRAIGHT + "0.4,a,0,0\n", [], "line 6, column x: 'a' is not a number"),
+    "short line": (ROD, STRAIGHT + "0.4,1\n", [], "line 6 has 2 cells"),
+    "s outside": (ROD, STRAIGHT + "0.5,0,0,0.5\n", [], "outside the rod"),
+    "s not increasing": (ROD, STRAIGHT + "0.3,0,0,0.3\n", [], "s increases"),
+    "s missing": (ROD, STRAIGHT + ",0,0,0.3\n", [], "column s: must be a finite number"),
+    "millimetres": (ROD, "s,x,y,z\n" + "".join(f"{0.1 * i:g},0,0,{100 * i}\n" for i in range(1, 5)), [], "give metres"),
+    "too few markers": (ROD, "s,x,y,z\n0.4,0,0,0.4\n", [], "add markers"),
+    "no tensions": (TENDON, STRAIGHT, [], "tensions are missing"),
+    "tensions of a passive rod": (ROD, "s,x,y,z,tension_1\n0.2,0,0,0.2,1\n0.4,0,0,0.4,1\n", [], "one per tendon"),
+    "tensions that change": (TENDON, "s,x,y,z,tension_1\n0.2,0,0,0.2,1\n0.4,0,0,0.4,2\n", [], "differ from row to row"),
+    "noise": (ROD, STRAIGHT, ["--noise", "-1"], "--noise is -1.0"),
+    "noise is a word": (ROD, STRAIGHT, ["--noise", "much"], "much"),
+    "contacts": (ROD, STRAIGHT, ["--contacts", "many"], "must be auto or a number"),
+    "prior": (ROD, STRAIGHT, ["--load-prior", "wide"], "wide"),
+    "location": (ROD, STRAIGHT, ["--location", "0.7"], "must lie on the rod"),
+    "output folder": (ROD, STRAIGHT, ["--out", "/no/such/folder/r.json"], "create it first"),
+    "output suffix": (ROD, STRAIGHT, ["--out", "result.txt"], "change the suffix"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
+    robot, shapes, options, words = BAD[name]
+    monkeypatch.chdir(tmp_path)
+    for file, content in (("robot.toml", robot), ("shapes.csv", shapes)):
+        if content is not None:
+            Path(file).write_text(content)
+    assert main(["estimate", "robot.toml", "shapes.csv", *options]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        (dict(s=np.array([0.1, 0.2]), positions=np.array([[{}, {}]], dtype=object)), "plain numbers"),
+        (dict(s=np.array([0.1, 0.2])), "'positions' is missing"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((3, 3))), "expected (P,) and (B, P, 3)"),
+        (dict(s=np.array(["a", "b"]), positions=np.zeros((1, 2, 3))), "does not hold numbers"),
+        (dict(s=np.array([0.1, np.nan]), positions=np.zeros((1, 2, 3))), "not finite"),
+    ],
+)
+def test_bad_npz(tmp_path, capsys, arrays, words):
+    (tmp_path / "robot.toml").write_text(ROD)
+    npz(tmp_path / "shapes.npz", **arrays)
+    assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.npz")]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_a_rod_of_400_metres_gets_a_warning_and_an_answer(tmp_path, capsys):
+    robot = ROD.replace("length = 0.4", "length = 400.0").replace("diameter = 0.0014", "diameter = 1.4")
+    shapes = "s,x,y,z\n" + "".join(f"{100 * i},0,0,{100 * i}\n" for i in range(1, 5))
+    run(tmp_path, robot, shapes, "--noise", "0.1", "--steps", "10")
+    assert "are the units metres?" in capsys.readouterr().err
+
+
+def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
+    (tmp_path / "r.toml").write_text(TENDON)
+    robot, out = str(tmp_path / "r.toml"), str(tmp_path / "s.csv")
+    for options, words in (
+        ([], "give 1 tensions"),
+        (["--tension", "-1"], "at least 0 N"),
+        (["--tension", "1", "--at", "0.1", "0.9"], "lie on the rod"),
+        (["--tension", "1", "--point", "0.1", "x", "0"], "three numbers"),
+        (["--tension", "1", "--point", "0.9", "1", "0"], "must lie on the rod"),
+    ):
+        assert main(["simulate", robot, "--out", out, *options]) == 2
+        assert words in capsys.readouterr().err
+    assert not Path(out).exists()

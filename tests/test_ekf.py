@@ -1,0 +1,92 @@
+"""The filter's algebra against the textbook's, written out here."""
+
+import torch
+
+from torchrod import ekf
+
+B, Z, N = 3, 20, 5
+
+
+def problem():
+    torch.manual_seed(0)
+    H, r, w = torch.randn(B, Z, N), torch.randn(B, Z), torch.rand(B, Z) + 0.5
+    root = torch.randn(B, N, N)
+    return H, r, w, root @ root.mT + torch.eye(N)
+
+
+def no_prior(x):
+    return x.new_zeros(N), x.new_zeros(N)
+
+
+def test_information_form_is_the_papers_recursion():
+    """(4) as printed, with the innovation z - h(x): K = S H^T (H S H^T + R)^-1, Sigma+ = (I - K H) S."""
+    H, r, w, Sigma = problem()
+    Q = torch.rand(N)
+    S = Sigma + torch.diag(Q)
+    K = S @ H.mT @ torch.linalg.inv(H @ S @ H.mT + torch.diag_embed(1 / w))
+    x = torch.zeros(B, N)
+    A, g = ekf.information(H, r, w, x, *no_prior(x))
+    step, Sigma_next = ekf.update(ekf.predict(Sigma, Q), A, g)
+    assert torch.allclose(step, (K @ r.unsqueeze(-1)).squeeze(-1), atol=1e-10)
+    assert torch.allclose(Sigma_next, (torch.eye(N) - K @ H) @ S, atol=1e-10)
+
+
+def test_on_a_linear_model_it_is_batch_least_squares():
+    """One update without Q from a prior N(x0, Sigma) is the weighted least squares solution, mean and covariance."""
+    H, z, w, Sigma = problem()
+    x0 = torch.randn(B, N)
+    A, g = ekf.information(H, z - (H @ x0.unsqueeze(-1)).squeeze(-1), w, x0, *no_prior(x0))
+    step, covariance = ekf.update(Sigma, A, g)
+    for b in range(B):
+        rows = torch.cat([H[b] * w[b].sqrt()[:, None], torch.linalg.inv(torch.linalg.cholesky(Sigma[b]))])
+        right = torch.cat([z[b] * w[b].sqrt(), torch.linalg.inv(torch.linalg.cholesky(Sigma[b])) @ x0[b]])
+        mean = torch.linalg.lstsq(rows, right[:, None]).solution[:, 0]
+        assert torch.allclose((x0 + step)[b], mean, atol=1e-10)
+        assert torch.allclose(covariance[b], torch.linalg.inv(rows.T @ rows), atol=1e-10)
+
+
+def test_a_prior_is_one_more_measurement():
+    H, r, w, _ = problem()
+    x, mean, precision = torch.randn(B, N), torch.randn(N), torch.rand(N) + 0.1
+    A, g = ekf.information(H, r, w, x, mean, precision)
+    more_H = torch.cat([H, torch.eye(N).expand(B, N, N)], 1)
+    more_r = torch.cat([r, mean - x], 1)
+    again = ekf.information(more_H, more_r, torch.cat([w, precision.expand(B, N)], 1), x, *no_prior(x))
+    assert torch.allclose(A, again[0])
+    assert torch.allclose(g, again[1])
+
+
+def test_posterior_counts_the_data_once_however_often_it_is_iterated():
+    """The recursion's Sigma shrinks with every iteration on the same data; the posterior does not."""
+    H, r, w, Sigma = problem()
+    x = torch.zeros(B, N)
+    A, g = ekf.information(H, r, w, x, *no_prior(x))
+    once = ekf.update(Sigma, A, g)[1]
+    twice = ekf.update(once, A, g)[1]
+    assert (twice.diagonal(dim1=1, dim2=2) < 0.6 * ekf.posterior(A).diagonal(dim1=1, dim2=2)).all()
+    assert torch.allclose(ekf.posterior(A), torch.linalg.inv(A), atol=1e-12)
+
+
+def test_decrement_is_what_a_step_gains():
+    H, r, w, _ = problem()
+    x = torch.zeros(B, N)
+    A, g = ekf.information(H, r, w, x, *no_prior(x))
+    left = r - (H @ torch.linalg.solve(A, g.unsqueeze(-1))).squeeze(-1)
+    assert torch.allclose(ekf.decrement(A, g), (w * r**2).sum(-1) - (w * left**2).sum(-1))
+
+
+def test_a_bad_sample_is_nan_and_alone():
+    _, _, _, Sigma = problem()
+    bad = Sigma.clone()
+    bad[1, 0, 0] = torch.nan
+    b = torch.ones(B, N, 1)
+    solved = ekf.solve_spd(bad, b)
+    assert solved[1].isnan().all()
+    assert torch.equal(solved[[0, 2]], ekf.solve_spd(Sigma, b)[[0, 2]])
+
+
+def test_adapted_weights_return_to_the_truth():
+    w = torch.tensor([[4.0, 4.0, 0.0, 100.0]])
+    assert torch.equal(ekf.inflation(w, 3, torch.tensor([6.0])), torch.tensor([3.0]))
+    assert torch.equal(ekf.adapted_weights(w, 3, torch.zeros(1)), w)
+    assert torch.allclose(ekf.adapted_weights(w, 3, torch.tensor([3.0])), torch.tensor([[1.0, 1.0, 0.0, 100.0]]))

@@ -1,0 +1,180 @@
+"""The estimator on simulated robots: accuracy, independence of the batch, and what it does with incomplete data."""
+
+import math
+
+import pytest
+import roma
+import torch
+
+from tests.robots import T, steel_rod
+from tests.study import study1
+from torchrod import (
+    FourierCoordinates,
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PaperCoordinates,
+    PointCoordinates,
+    PointForces,
+    Settings,
+    Status,
+    estimate,
+    paper_settings,
+    solve_shape,
+)
+
+
+@pytest.mark.parametrize(
+    ("noise", "sigma", "prior", "millimetres", "newtons"),
+    [(0.0, 1e-4, "point", 0.1, 0.001), (1e-3, 1e-3, "point", 5.5, 0.05), (1e-3, 1e-3, "contact", 5.5, 0.05)],
+)
+def test_study_1(noise, sigma, prior, millimetres, newtons):
+    """Every case converges and is accepted, within ten iterations in the mean, and as accurately as issue 2 asks."""
+    study = study1()
+    fit = study.estimate(noise, prior, sigma)
+    assert (fit.status == Status.CONVERGED).all()
+    assert fit.accepted.all()
+    assert fit.iterations.double().mean() <= 10
+    assert (fit.location[:, 0] - study.location).abs().mean() <= millimetres * 1e-3
+    assert (fit.force[:, 0] - study.force).norm(dim=-1).mean() <= 2 * newtons
+    assert (fit.magnitude[:, 0] - study.force.norm(dim=-1)).abs().mean() <= newtons
+
+
+def test_the_reported_spread_is_the_observed_one():
+    """Study 1 with 1 mm noise: normalized errors of location and magnitude have about unit variance."""
+    study = study1()
+    fit = study.estimate(1e-3, "point", 1e-3)
+    location = (fit.location[:, 0] - study.location) / fit.location_std[:, 0]
+    magnitude = (fit.magnitude[:, 0] - study.force.norm(dim=-1)) / fit.magnitude_std[:, 0]
+    for z in (location, magnitude):
+        assert 0.8 < z.square().mean().sqrt() < 1.2
+
+
+def test_a_samples_answer_does_not_depend_on_its_batch():
+    """With a NaN neighbour, one that is nonsense, and one that has too few markers."""
+    study = study1(4)
+    positions = study.positions.clone()
+    positions[1] = torch.nan
+    positions[2] = 5 * torch.randn(positions[2].shape, generator=torch.Generator().manual_seed(0))
+    positions[3, 1:] = torch.nan
+    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
+    limit = Settings(max_iterations=12)
+    together = estimate(model, Markers(study.s, positions), 1e-3, limit)
+    assert together.status.tolist()[0] == Status.CONVERGED
+    assert together.status.tolist()[1] == together.status.tolist()[3] == Status.INVALID
+    assert not together.accepted[2]
+    assert together.x[1].isnan().all()
+    assert "more markers" in together.message(3)
+    for i in (0, 2):
+        alone = estimate(model, Markers(study.s, positions[i : i + 1]), 1e-3, limit)
+        assert torch.allclose(together.x[i], alone.x[0], rtol=0, atol=1e-9)
+        assert torch.allclose(together.covariance[i], alone.covariance[0], rtol=1e-9, atol=1e-9)
+        assert together.iterations[i] == alone.iterations[0]
+
+
+def test_missing_markers_are_left_out():
+    """A NaN marker changes the answer exactly as if it had never been there."""
+    study = study1(2)
+    gone, kept = [3, 11, 19], [i for i in range(20) if i not in (3, 11, 19)]
+    positions = study.positions.clone()
+    positions[:, gone] = torch.nan
+    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
+    holes = estimate(model, Markers(study.s, positions), 1e-3)
+    fewer = estimate(model, Markers(study.s[kept], study.positions[:, kept]), 1e-3)
+    assert torch.allclose(holes.force, fewer.force, atol=1e-6)
+    assert torch.equal(holes.dof, fewer.dof)
+    assert holes.residual[:, gone].isnan().all()
+
+
+def test_a_known_location_is_kept():
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    shape = solve_shape(robot, (PointForces(T([[[0.3, 0.5, 0.0]]]), T([[0.22]])),), None, s, 1)
+    for coordinates in (GaussianCoordinates(1, 0.4, 1.0, "point", (0.22,)), PointCoordinates(1, 0.4, 1.0, (0.22,))):
+        fit = estimate(Model(robot, coordinates), Markers(s, shape.p), 1e-4)
+        assert fit.accepted[0]
+        assert fit.location[0, 0] == 0.22
+        assert torch.allclose(fit.force[0, 0], T([0.3, 0.5]), atol=1e-3)
+        assert fit.location_std[0, 0] == 0
+
+
+def test_registration_recovers_a_wrong_base_frame():
+    """5 mm and 3 degrees off; without registration the fit is refused and says to look at registration."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    shape = solve_shape(robot, (PointForces(T([[[0.6, 0.5, 0.0]]]), T([[0.22]])),), None, s, 1)
+    c, d = math.cos(math.radians(3)), math.sin(math.radians(3))
+    seen = shape.p @ T([[1.0, 0, 0], [0, c, -d], [0, d, c]]).T + T([0.003, -0.004, 0.0])
+    coordinates = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")
+    fit = estimate(Model(robot, coordinates, registration=True), Markers(s, seen), 1e-4)
+    assert fit.accepted[0]
+    assert fit.registration is not None
+    assert torch.allclose(fit.registration[0], T([0.003, -0.004, 0.0, math.radians(3), 0.0, 0.0]), atol=2e-3)
+    assert abs(float(fit.location[0, 0]) - 0.22) < 2e-3
+    plain = estimate(Model(robot, coordinates), Markers(s, seen), 1e-4)
+    assert not plain.accepted[0]
+    assert "registration" in plain.message(0)
+
+
+def test_markers_off_the_centre_line():
+    """p(s) + R(s) r: offset markers see the same load; taken for the centre line they are refused."""
+    robot, s = steel_rod(), torch.linspace(0.05, 0.4, 8)
+    shape = solve_shape(robot, (PointForces(T([[[0.6, 0.5, 0.0]]]), T([[0.25]])),), None, s, 1)
+    offsets = T([[0.01, 0.0, 0.0], [0.0, -0.01, 0.0]]).repeat(4, 1)
+    seen = shape.p + roma.quat_action(shape.q, offsets.unsqueeze(0))
+    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point"))
+    fit = estimate(model, Markers(s, seen, offsets), 1e-4)
+    assert fit.accepted[0]
+    assert abs(float(fit.location[0, 0]) - 0.25) < 1e-3
+    assert not estimate(model, Markers(s, seen), 1e-4, Settings(max_iterations=20)).accepted[0]
+
+
+@pytest.mark.parametrize("family", ["point", "fourier"])
+def test_the_other_families_fit_the_shape(family):
+    """Points and a Fourier series stand beside the Gaussians: two point loads, fitted to 0.1 mm."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    shape = solve_shape(robot, (PointForces(T([[[0.6, 0.5, 0.0], [-0.2, 0.4, 0.0]]]), T([[0.15, 0.3]])),), None, s, 1)
+    scale = robot.rod.force_scale
+    coordinates = PointCoordinates(2, 0.4, scale) if family == "point" else FourierCoordinates(3, 0.4, scale)
+    fit = estimate(Model(robot, coordinates), Markers(s, shape.p), 1e-4)
+    assert fit.status[0] == Status.CONVERGED
+    assert fit.rms_residual[0] < 1e-4
+    if family == "point":
+        assert torch.allclose(fit.location[0].sort().values, T([0.15, 0.3]), atol=1e-3)
+    else:
+        assert torch.allclose(fit.force[0, 0], T([0.4, 0.9]), atol=0.05)
+
+
+def test_the_paper_mode_runs_the_plain_recursion():
+    """The paper's parameters without safeguards converge on an easy case, to the same load as the default."""
+    study = study1(1)
+    model = Model(study.robot, PaperCoordinates(1, 0.4), scaled=False, steps=20)
+    fit = estimate(model, Markers(study.s, study.positions), 1e-3, paper_settings(model))
+    assert fit.status[0] == Status.CONVERGED
+    assert (fit.location[0, 0] - study.location[0]).abs() < 0.03
+
+
+def test_a_load_at_the_tip_has_its_whole_force_on_the_rod():
+    """The default reports what the rod feels; (13) counts the half of the Gaussian that hangs over the tip as well."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    shape = solve_shape(robot, (PointForces(T([[[0.8, 0.0, 0.0]]]), T([[0.4]])),), None, s, 1)
+    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point", (0.4,)))
+    fit = estimate(model, Markers(s, shape.p), 1e-4)
+    assert abs(float(fit.magnitude[0, 0]) - 0.8) < 0.03
+    assert torch.allclose(fit.net_force, 2 * fit.force, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (dict(noise=0.0), "must be positive"),
+        (dict(s=[0.1, 0.5]), "outside the rod"),
+        (dict(s=[0.4]), "add markers"),
+        (dict(tension=[[1.0]]), "1 tensions but the robot has 0"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_remedy(change, words):
+    robot = steel_rod()
+    model = Model(robot, GaussianCoordinates(1, 0.4, 1.0))
+    s = T(change.get("s", [0.2, 0.4]))
+    tension = T(change["tension"]) if "tension" in change else None
+    with pytest.raises(ValueError, match=words):
+        estimate(model, Markers(s, torch.zeros(1, len(s), 3), None, tension), change.get("noise", 1e-3))

@@ -1,0 +1,32 @@
+"""H = dh/dx by forward mode against central differences, gravity, helical tendons, registration and offsets included."""
+
+import torch
+
+from tests.robots import T, busy_robot
+from torchrod import GaussianCoordinates, Markers, Model, PointCoordinates, forward_jacobian
+
+
+def check(model: Model, markers: Markers, x: torch.Tensor) -> None:
+    _, J = forward_jacobian(lambda x: model.h(x, markers), x)
+    d = 1e-6
+    columns = [(model.h(x + d * e, markers) - model.h(x - d * e, markers)) / (2 * d) for e in torch.eye(model.size)]
+    assert torch.isfinite(J).all()
+    assert (J - torch.stack(columns, -1)).abs().max() < 1e-6 * J.abs().max()
+
+
+def test_h_has_exact_derivatives():
+    robot = busy_robot()
+    markers = Markers(T([0.1, 0.23, 0.4]), torch.zeros(2, 3, 3), 0.01 * torch.eye(3), T([[3.0, 2.0], [1.0, 4.0]]))
+    torch.manual_seed(0)
+    for coordinates in (GaussianCoordinates(1, 0.4, robot.rod.force_scale), PointCoordinates(1, 0.4, robot.rod.force_scale)):
+        model = Model(robot, coordinates, registration=True)
+        start = model.join(coordinates.start().expand(2, -1), torch.zeros(2, 6))
+        check(model, markers, start + 0.3 * torch.randn(2, model.size))
+
+
+def test_derivatives_are_exact_at_zero_load_zero_strain_and_zero_rotation():
+    robot = busy_robot()
+    coordinates = GaussianCoordinates(2, 0.4, robot.rod.force_scale)
+    model = Model(robot, coordinates, registration=True)
+    markers = Markers(T([0.1, 0.4]), torch.zeros(1, 2, 3), torch.zeros(2, 3), T([[0.0, 0.0]]))
+    check(model, markers, model.join(coordinates.start().unsqueeze(0), torch.zeros(1, 6)))
