@@ -10,7 +10,6 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
@@ -102,15 +101,15 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
     FigureCanvasAgg(figure)
     axes = figure.add_subplot(projection="3d")
     assert isinstance(axes, Axes3D)
-    for line in scene.tendons:
-        axes.plot(*line.T.numpy(), color=TENDON, linewidth=0.8)
+    for i, line in enumerate(scene.tendons):
+        axes.plot(*line.T.numpy(), color=TENDON, linewidth=1.2, label=None if i else "tendons")
     axes.plot(*scene.line.T.numpy(), color=INK, linewidth=2.5, label="fitted rod")
     axes.scatter(*seen.T.numpy(), color=MARKER, s=28, depthshade=False, label="markers")  # pyright: ignore[reportArgumentType]
     if scene.loaded.any():
         axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, label="load per length")
         for i in scene.loaded.nonzero().flatten().tolist():
             axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5)
-    labels: list[tuple[tuple[float, float, float], tuple[float, float, float], str]] = []
+    labels: list[tuple[tuple[float, float, float], str]] = []
     for k, (head, tail) in enumerate(zip(scene.points, scene.tails, strict=True)):
         axes.quiver(
             *tail.tolist(),
@@ -120,15 +119,14 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
             arrow_length_ratio=0.18,
             label="net force" if k == 0 else None,
         )
-        text = f" {float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
-        labels.append((tuple(tail.tolist()), tuple(head.tolist()), text))
+        text = f"{float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
+        labels.append((tuple(tail.tolist()), text))
     axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, label="clamp")
     everything = torch.cat([scene.line, seen, scene.tails, scene.envelope])
     _equal_axes(axes, everything)
     _look_across(axes, torch.cat([scene.line[-1:] - scene.line[:1], scene.points - scene.tails]))
     axes.set_title(textwrap.fill(title, 80), fontsize=12)
-    for tail, head, text in labels:
-        (x, y, z), across = tail, [proj3d.proj_transform(*end, axes.get_proj())[0] for end in (tail, head)]
-        axes.text(x, y, z, text, color=LOAD, fontsize=11, fontweight="bold", ha="left" if across[0] >= across[1] else "right")
-    figure.legend(loc="outside lower center", ncols=5, frameon=False)
+    for (x, y, z), text in labels:
+        axes.text(x, y, z, text, color=LOAD, fontsize=11, fontweight="bold", ha="center", va="bottom")
+    figure.legend(loc="outside lower center", ncols=6, frameon=False)
     figure.savefig(path, dpi=150)
