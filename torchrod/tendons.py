@@ -92,15 +92,21 @@ def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "..
     return (table.L * (along / stretch).unsqueeze(-1)).sum(-2), stretch
 
 
-def balance_inverse(K_se: Matrix, K_bt: Matrix, table: TendonTable, g: Float[Tensor, "... T 6"], stretch: Float[Tensor, "... T 1"]):
+def balance_inverse(
+    K_se: Matrix,
+    K_bt: Matrix,
+    tau: Float[Tensor, "... T"],
+    LtL: Float[Tensor, "... T 6 6"],
+    g: Float[Tensor, "... T 6"],
+    stretch: Float[Tensor, "... T 1"],
+) -> Float[Tensor, "... 6 6"]:
     """Inverse (..., 6, 6) of the Hessian of strain energy plus tendon energy, symmetric positive definite,
 
         diag(K_se, K_bt) + sum_j (tau_j / stretch_j) (L_j^T L_j - g_j g_j^T)
 
     by 3 x 3 blocks [[A, B], [B^T, C]] with the Schur complement of A.
     """
-    weight = (table.tau.unsqueeze(-1) / stretch).unsqueeze(-1)
-    LtL = (table.L.unsqueeze(-1) * table.L.unsqueeze(-2)).sum(-3)
+    weight = (tau.unsqueeze(-1) / stretch).unsqueeze(-1)
     J = (weight * (LtL - g.unsqueeze(-1) * g.unsqueeze(-2))).sum(-3)
     A, B, C = K_se + J[..., :3, :3], J[..., :3, 3:], K_bt + J[..., 3:, 3:]
     Ainv = inverse3(A)
@@ -133,10 +139,11 @@ def balanced_strains(
     w = torch.cat([N, M], -1)
     w0, K_se0, K_bt0 = w.detach(), K_se.detach(), K_bt.detach()
     frozen = TendonTable(table.L, table.dr, table.tau.detach())
+    LtL = (table.L.unsqueeze(-1) * table.L.unsqueeze(-2)).sum(-3)
     x, inverse = x_star, x_star
     for _ in range(NEWTON_STEPS):
         g, stretch = tendon_directions(x, frozen)
-        inverse = balance_inverse(K_se0, K_bt0, frozen, g, stretch)
+        inverse = balance_inverse(K_se0, K_bt0, frozen.tau, LtL, g, stretch)
         x = x + (inverse * misfit(x, w0, g, frozen.tau, K_se0, K_bt0).unsqueeze(-2)).sum(-1)
     g, _ = tendon_directions(x, frozen)
     x = x + (inverse * misfit(x, w, g, table.tau, K_se, K_bt).unsqueeze(-2)).sum(-1)
