@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import reference
+from torchrod.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -25,12 +26,8 @@ def test_snippets_run(page):
 
 
 def test_the_readme_names_options_and_commands_that_exist():
-    from torchrod.cli import _parser
-
     text = (ROOT / "README.md").read_text() + (ROOT / "docs" / "files.md").read_text()
-    usage = {}
-    for name, sub in _parser()._subcommands_action._name_parser_map.items():
-        usage[name] = sub.format_help()
+    usage = {name: make().format_help() for name, (make, _) in COMMANDS.items()}
     for option in set(re.findall(r"`(--[a-z-]+)", text)):
         assert any(option in help_text for help_text in usage.values()), option
     for command in set(re.findall(r"(?:`|^)torchrod ([a-z]+)", text, re.MULTILINE)):

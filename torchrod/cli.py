@@ -78,12 +78,18 @@ def _plot_parser() -> ArgumentParser:
     return parser
 
 
+COMMANDS = {
+    "estimate": (_estimate_parser, "loads from marker positions"),
+    "simulate": (_simulate_parser, "marker positions from known loads"),
+    "plot": (_plot_parser, "a figure of an estimate"),
+}
+
+
 def _parser() -> ArgumentParser:
     parser = _Parser(prog="torchrod", description="Forces from shape: the loads on a continuum robot from its measured markers.")
     commands = parser.add_subcommands(required=True)
-    commands.add_subcommand("estimate", _estimate_parser(), help="loads from marker positions")
-    commands.add_subcommand("simulate", _simulate_parser(), help="marker positions from known loads")
-    commands.add_subcommand("plot", _plot_parser(), help="a figure of an estimate")
+    for name, (make, help) in COMMANDS.items():
+        commands.add_subcommand(name, make(), help=help)
     return parser
 
 
