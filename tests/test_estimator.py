@@ -144,12 +144,14 @@ def test_the_other_families_fit_the_shape(family):
 
 
 def test_the_paper_mode_runs_the_plain_recursion():
-    """The paper's parameters without safeguards converge on an easy case, to the same load as the default."""
-    study = study1(1)
-    model = Model(study.robot, PaperCoordinates(1, 0.4), scaled=False, steps=20)
+    """The paper's parameters without safeguards: most of Study 1 converges, to the true load, and far more slowly."""
+    study = study1()
+    model = Model(study.robot, PaperCoordinates(1, 0.4), scaled=False)
     fit = estimate(model, Markers(study.s, study.positions), 1e-3, paper_settings(model))
-    assert fit.status[0] == Status.CONVERGED
-    assert (fit.location[0, 0] - study.location[0]).abs() < 0.03
+    done = fit.status == Status.CONVERGED
+    assert 0.5 < done.double().mean() < 0.95
+    assert fit.iterations[done].double().mean() > 30
+    assert (fit.location[:, 0] - study.location)[done].abs().mean() < 1e-3
 
 
 def test_a_load_at_the_tip_has_its_whole_force_on_the_rod():

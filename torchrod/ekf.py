@@ -82,8 +82,11 @@ def decrement(A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> Float[Tenso
 
 
 def inflation(w: Float[Tensor, "B z"], markers: int, decrement: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """decrement / m, with m the number of marker coordinates seen: what a Gauss-Newton step promises to remove from each."""
-    return decrement / (w[:, :markers] > 0).sum(-1).clamp(min=1)
+    """decrement / m, with m the number of marker coordinates seen: what a Gauss-Newton step promises to remove from each.
+
+    Zero where there is no such step: without a prior, a load of no force makes H^T W H singular.
+    """
+    return decrement.nan_to_num(0.0) / (w[:, :markers] > 0).sum(-1).clamp(min=1)
 
 
 def adapted_weights(w: Float[Tensor, "B z"], markers: int, inflated: Float[Tensor, " B"]) -> Float[Tensor, "B z"]:

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import PaperCoordinates
-from .jacobian import forward_jacobian
 from .measurement import Markers, Model
 from .result import Estimate, make_estimate
 from .rod import DTYPE
@@ -70,7 +69,7 @@ class Linearized:
 
 def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[Tensor, "B z"]) -> Linearized:
     """r = z - h(x) (zero where a marker is missing), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
-    h, H = forward_jacobian(lambda x: model.h(x, markers), x)
+    h, H = model.linearized(x, markers)
     z = torch.cat([markers.positions.flatten(1), h.new_zeros(len(h), 6)], -1)
     r = torch.where(w > 0, z - h, 0.0)
     mean, precision = model.prior()

@@ -22,6 +22,16 @@ class Grid:
     outputs: Int[Tensor, "... P"]
 
     @property
+    def outputs_and_tip(self) -> Int[Tensor, "... P1"]:
+        """The outputs' nodes, and the last node."""
+        return torch.cat([self.outputs, torch.full_like(self.outputs[..., :1], self.nodes.shape[-1] - 1)], -1)
+
+    @property
+    def outputs_and_base(self) -> Int[Tensor, "... P1"]:
+        """The outputs' nodes, and the first node."""
+        return torch.cat([self.outputs, torch.zeros_like(self.outputs[..., :1])], -1)
+
+    @property
     def h(self) -> Float[Tensor, "... S"]:
         """Step lengths (m)."""
         return self.nodes.diff(dim=-1)

@@ -5,17 +5,22 @@
 gamma are the loads (torchrod.coordinates), zeta an optional registration twist, alpha the base wrench, c the tip residual (17).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.func import jvp, vmap
 
 from .coordinates import LoadCoordinates
 from .grid import DEFAULT_STEPS
+from .jacobian import forward_jacobian
 from .lie import move, rotate
+from .loads import LoadIntegrals, total
+from .march import march_linearized
 from .robot import Robot
-from .statics import Shape, shape_from_base
+from .statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table
+from .step import Section
 
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
@@ -63,8 +68,12 @@ class Model:
         """The length of x."""
         return self.coordinates.size + 6 * self.registration + 6
 
-    def _scale_of(self, x: Tensor, first: float, second: float) -> Tensor:
+    def _scale_of(self, x: Tensor, first: float, second: float) -> Float[Tensor, " 6"]:
         return x.new_tensor([first] * 3 + [second] * 3) if self.scaled else x.new_ones(6)
+
+    def alpha_scale(self, x: Tensor) -> Float[Tensor, " 6"]:
+        """One unit of alpha's entries in x: the rod's force and moment scales (N, N m), or 1."""
+        return self._scale_of(x, self.robot.rod.force_scale, self.robot.rod.moment_scale)
 
     def split(
         self, x: Float[Tensor, "... n"]
@@ -73,12 +82,12 @@ class Model:
         gamma, zeta, alpha = x.tensor_split([self.coordinates.size, self.size - 6], -1)
         rod = self.robot.rod
         zeta = zeta * self._scale_of(x, TURN_SCALE * rod.length, TURN_SCALE) if self.registration else None
-        return gamma, zeta, alpha * self._scale_of(x, rod.force_scale, rod.moment_scale)
+        return gamma, zeta, alpha * self.alpha_scale(x)
 
     def join(self, gamma: Float[Tensor, "B g"], alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:
         """x from loads and a base wrench (N, N m), with no registration error."""
         zeta = alpha.new_zeros(alpha.shape[0], 6 * self.registration)
-        return torch.cat([gamma, zeta, alpha / self._scale_of(alpha, self.robot.rod.force_scale, self.robot.rod.moment_scale)], -1)
+        return torch.cat([gamma, zeta, alpha / self.alpha_scale(alpha)], -1)
 
     def shape(self, x: Float[Tensor, "... n"], markers: Markers) -> Shape:
         """The rod at the markers' arc lengths, in its own base frame."""
@@ -87,12 +96,75 @@ class Model:
 
     def h(self, x: Float[Tensor, "... n"], markers: Markers) -> Float[Tensor, "... z"]:
         """[p_1 .. p_P (m), c (N, N m)], (..., 3 P + 6): marker positions in the measured frame, then the tip residual."""
-        shape = self.shape(x, markers)
+        return self._seen(self.shape(x, markers), x, markers)
+
+    def _seen(self, shape: Shape, x: Float[Tensor, "... n"], markers: Markers) -> Float[Tensor, "... z"]:
+        """What the markers show of a shape."""
         p = shape.p if markers.offsets is None else shape.p + rotate(shape.q, markers.offsets)
         _, zeta, _ = self.split(x)
         if zeta is not None:
             p = move(zeta, p)
         return torch.cat([p.flatten(-2), shape.tip_residual], -1)
+
+    def linearized(self, x: Float[Tensor, "B n"], markers: Markers) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """h(x) and H = dh/dx.
+
+        The rod's share of the tangents goes through `march_linearized`, which has a compiled path; what comes before it (load
+        integrals of gamma) and after it (offsets, registration, tip residual) by torch.func. The same as forward_jacobian(h),
+        which is what is used where the nodes themselves move with x (point loads at unknown places).
+        """
+        gamma, _, _ = self.split(x)
+        loads = self.coordinates.loads(gamma)
+        grid = grid_for(self.robot, loads, markers.s, self.steps)
+        if grid.nodes.ndim > 1:
+            return forward_jacobian(lambda x: self.h(x, markers), x)
+        g, B, S = self.coordinates.size, len(x), grid.h.shape[-1]
+        like = x.new_zeros(())
+
+        def integrals(gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B m"]:
+            """[G, G2] at every stage, then just beyond the tip."""
+            loads = self.coordinates.loads(gamma)
+            along, beyond = total(loads, grid.stages, grid.inside), beyond_tip(self.robot, loads, like)
+            assert along.G is not None and along.G2 is not None and beyond.G is not None and beyond.G2 is not None
+            return torch.cat([torch.cat([along.G, along.G2], -1).reshape(B, 18 * S), beyond.G, beyond.G2], -1)
+
+        value, slope = forward_jacobian(integrals, gamma)
+        G, dG = value[:, :-6].reshape(B, S, 3, 6), slope[:, :-6].reshape(B, S, 3, 6, g)
+        known = stage_table(self.robot, (), markers.tension, grid)
+        table = replace(known, loads=known.loads + LoadIntegrals(G[..., :3], G[..., 3:]))
+        dy0 = x.new_zeros(B, 13, g + 6)
+        dy0[:, range(7, 13), range(g, g + 6)] = alpha_scale = self.alpha_scale(x)
+        y0 = base_state(self.robot, x[:, -6:] * alpha_scale, table)
+        section = Section.of(self.robot.rod.K_se, self.robot.rod.K_bt)
+        states, tangents = march_linearized(section, y0, dy0, table, dG, grid, grid.outputs_and_tip)
+        return self._after(section, states, tangents, value[:, -6:], slope[:, -6:], x, markers)
+
+    def _after(
+        self,
+        section: Section,
+        states: Float[Tensor, "B P1 13"],
+        tangents: Float[Tensor, "B P1 13 m"],
+        beyond: Float[Tensor, "B 6"],
+        dbeyond: Float[Tensor, "B 6 g"],
+        x: Float[Tensor, "B n"],
+        markers: Markers,
+    ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """h and H from the marched states and the loads beyond the tip, and how they move with gamma and alpha."""
+        g, n = self.coordinates.size, self.size
+        where = torch.tensor([*range(g), *range(n - 6, n)])
+        d_states = tangents.new_zeros(n, *states.shape).index_copy(0, where, tangents.movedim(-1, 0))
+        d_beyond = beyond.new_zeros(n, *beyond.shape).index_copy(0, where[:g], dbeyond.movedim(-1, 0))
+
+        def seen(states: Tensor, beyond: Tensor, x: Tensor) -> Tensor:
+            return self._seen(shape_of(section, states, LoadIntegrals(beyond[..., :3], beyond[..., 3:])), x, markers)
+
+        def column(ds: Tensor, db: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
+            value, tangent, *_ = jvp(seen, (states, beyond, x), (ds, db, e.expand_as(x).contiguous()))
+            return value, tangent
+
+        axes = vmap(column, out_dims=(None, 0))  # pyright: ignore[reportArgumentType]
+        h, columns = axes(d_states, d_beyond, torch.eye(n, dtype=x.dtype))
+        return h, columns.movedim(0, -1)
 
     def tip_weights(self, like: Tensor) -> Float[Tensor, " 6"]:
         """1 / variance of the tip residual c (1/N^2, 1/(N m)^2): stiff, so that (17) holds to a milli-force-scale."""

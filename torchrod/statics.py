@@ -16,9 +16,10 @@ from .grid import DEFAULT_STEPS, Grid, make_grid
 from .jacobian import forward_jacobian
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, matvec, normalized, rotate
 from .loads import Load, LoadIntegrals, total
+from .march import march, march_linearized, states_at
 from .robot import Robot
 from .status import Status
-from .step import STATE_PARTS, Section, StageTable, State, rk4_step, section_wrench
+from .step import STATE_PARTS, Section, StageTable, State, section_wrench
 
 ORIENTATION_TOLERANCE = 1e-11  # rad: the forward solve's residual, far below what RK4 leaves
 INCREMENT_TOLERANCE = 1e-3  # rad: enough on the way to the full load
@@ -42,18 +43,6 @@ def grid_for(robot: Robot, loads: tuple[Load, ...], outputs: Float[Tensor, " P"]
     leading = torch.broadcast_shapes(*(b.shape[:-1] for b in jumps)) if jumps else ()
     breakpoints = torch.cat([b.expand(*leading, -1) for b in jumps], -1) if jumps else None
     return make_grid(robot.rod.length, outputs, robot.tendons.ends, breakpoints, steps)
-
-
-def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bool = False) -> Float[Tensor, "... S1 13"]:
-    """The state at every node, in the order of the nodes; `reverse` starts from the last node."""
-    h, states = grid.h, [y]
-    steps = range(h.shape[-1])
-    table = table.reversed() if reverse else table
-    for i in reversed(steps) if reverse else steps:
-        at, length = table.step(i), h[..., i]
-        y = rk4_step(section, y, at, -length) if reverse else rk4_step(section, y, at, length)
-        states.append(y)
-    return torch.stack(states[::-1] if reverse else states, -2)
 
 
 def beyond_tip(robot: Robot, loads: tuple[Load, ...], like: Tensor) -> LoadIntegrals:
@@ -88,10 +77,14 @@ class Shape:
     tip_residual: Float[Tensor, "... 6"]
 
 
-def _take(values: Float[Tensor, "... S1 c"], at: Int[Tensor, "... P"]) -> Float[Tensor, "... P c"]:
-    if at.ndim == 1:
-        return values[..., at, :]
-    return values.gather(-2, at.unsqueeze(-1).expand(*values.shape[:-2], at.shape[-1], values.shape[-1]))
+def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadIntegrals) -> Shape:
+    """The shape at the first P states; the tip residual (17) from the last, the wrench carried just beyond the tip:
+
+    c = [N~ - G, M~ + e3 x G2 - Gm] at s = L+, zero in equilibrium
+    """
+    p, q, N, M = states.split(STATE_PARTS, -1)
+    c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond)
+    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1))
 
 
 def shape_from_base(
@@ -102,18 +95,12 @@ def shape_from_base(
     outputs: Float[Tensor, " P"],
     steps: int,
 ) -> Shape:
-    """March base to tip under alpha. Tip residual (17): the wrench carried just beyond the tip, which is zero in equilibrium:
-
-    c = [N~ - G, M~ + e3 x G2 - Gm] at s = L+
-    """
+    """March base to tip under alpha = [n(0) (N), m(0) (N m)]; outputs in m. The tip need not be in equilibrium."""
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
-    y0 = base_state(robot, alpha, table)
-    states = march(section, y0, table, grid)
-    p, q, N, M = states.split(STATE_PARTS, -1)
-    c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond_tip(robot, loads, alpha))
-    return Shape(_take(p, grid.outputs), _take(q, grid.outputs), torch.cat(c, -1))
+    states = march(section, base_state(robot, alpha, table), table, grid)
+    return shape_of(section, states_at(states, grid.outputs_and_tip), beyond_tip(robot, loads, alpha))
 
 
 @dataclass(frozen=True)
@@ -143,17 +130,29 @@ class _TipProblem:
     grid: Grid
     wrench: Float[Tensor, "B 6"]
 
-    def states(self, q_tip: Quaternion, fraction: Float[Tensor, " B"]) -> Float[Tensor, "... S1 13"]:
-        y = torch.cat([torch.zeros_like(q_tip[..., :3]), q_tip, self.wrench.expand(*q_tip.shape[:-1], 6)], -1)
-        return march(self.section, y, self.table.with_base_frame_loads_scaled(fraction), self.grid, reverse=True)
+    def march(
+        self, q_tip: Float[Tensor, "B 4"], dq_tip: Float[Tensor, "B 4 n"], fraction: Float[Tensor, " B"], keep: Int[Tensor, "*B P"]
+    ) -> tuple[Float[Tensor, "B P 13"], Float[Tensor, "B P 13 n"]]:
+        """States at the nodes `keep`, and their derivatives when the tip's orientation moves along dq_tip."""
+        y = torch.cat([torch.zeros_like(q_tip[:, :3]), q_tip, self.wrench], -1)
+        dy = torch.nn.functional.pad(dq_tip, (0, 0, 3, 6))
+        return march_linearized(
+            self.section, y, dy, self.table.with_base_frame_loads_scaled(fraction), None, self.grid, keep, reverse=True
+        )
 
-    def base_rotation(self, q_tip: Quaternion, fraction: Float[Tensor, " B"]) -> Vector:
-        """r(q_tip): the rotation vector by which the base misses the identity (rad)."""
-        return roma.unitquat_to_rotvec(self.states(q_tip, fraction)[..., 0, 3:7])
+    def base(
+        self, q_tip: Float[Tensor, "B 4"], dq_tip: Float[Tensor, "B 4 n"], fraction: Float[Tensor, " B"]
+    ) -> tuple[Vector, Tensor]:
+        """r(q_tip), the rotation vector by which the base misses the identity (rad), and its derivatives (B, 3, n)."""
+        first = torch.zeros(*self.grid.nodes.shape[:-1], 1, dtype=torch.int64)
+        states, tangents = self.march(q_tip, dq_tip, fraction, first)
+        r, dr = forward_jacobian(roma.unitquat_to_rotvec, states[:, 0, 3:7])
+        return r, dr @ tangents[:, 0, 3:7]
 
-    def newton_step(self, q_tip: Quaternion, fraction: Float[Tensor, " B"]) -> tuple[Vector, Vector]:
+    def newton_step(self, q_tip: Float[Tensor, "B 4"], fraction: Float[Tensor, " B"]) -> tuple[Vector, Vector]:
         """r, and the tip's turn -J^-1 r in the base frame."""
-        r, J = forward_jacobian(lambda w: self.base_rotation(turned(w, q_tip), fraction), torch.zeros_like(q_tip[..., :3]))
+        _, dq = forward_jacobian(lambda w: turned(w, q_tip), torch.zeros_like(q_tip[:, :3]))
+        r, J = self.base(q_tip, dq, fraction)
         return r, -matvec(inverse3(J), r)
 
 
@@ -221,7 +220,8 @@ def solve_shape(
     problem = _TipProblem(section, table, grid, torch.cat([N, M if beyond.Gm is None else M + beyond.Gm], -1))
 
     q, one = identity_quaternion((batch,), zero), torch.ones_like(zero[:, 0])
-    q = turned(-problem.base_rotation(q, 0 * one), q)  # exact where no load keeps its direction in the base frame
+    r, _ = problem.base(q, zero.new_zeros(batch, 4, 0), 0 * one)
+    q = turned(-r, q)  # exact where no load keeps its direction in the base frame
     residual, iterations = 0 * one, torch.zeros(batch, dtype=torch.int64)
     if table.loads.Wn is not None or table.loads.Wm is not None:
         increments = _increments(robot, table, batch)
@@ -238,22 +238,22 @@ def _equilibrium(
     iterations: Int[Tensor, " B"],
     outputs: Float[Tensor, " P"],
 ) -> Equilibrium:
-    states = problem.states(q_tip, torch.ones_like(residual))
+    at = problem.grid.outputs_and_base
+    states, _ = problem.march(q_tip, q_tip.new_zeros(len(q_tip), 4, 0), torch.ones_like(residual), at)
     p, q, N, M = states.split(STATE_PARTS, -1)
     base = problem.table.step(0).stage(0).loads
     base = LoadIntegrals(Wn=base.Wn, Wm=base.Wm)
-    n0, m0 = section_wrench(q[:, 0], N[:, 0], M[:, 0], problem.section.e3, base)
-    wrench = torch.cat([rotate(q[:, 0], n0), rotate(q[:, 0], m0)], -1)
+    n0, m0 = section_wrench(q[:, -1], N[:, -1], M[:, -1], problem.section.e3, base)
+    wrench = torch.cat([rotate(q[:, -1], n0), rotate(q[:, -1], m0)], -1)
     finite = torch.isfinite(states).flatten(1).all(-1)
     solved = finite & (residual <= 10 * ORIENTATION_TOLERANCE)
     status = torch.full_like(iterations, int(Status.NOT_CONVERGED))
     status = torch.where(solved, int(Status.CONVERGED), torch.where(finite, status, int(Status.INVALID)))
-    at = problem.grid.outputs
     keep = solved[:, None, None]
     return Equilibrium(
         outputs,
-        torch.where(keep, _take(p - p[:, :1], at), torch.nan),
-        torch.where(keep, _take(q, at), torch.nan),
+        torch.where(keep, p[:, :-1] - p[:, -1:], torch.nan),
+        torch.where(keep, q[:, :-1], torch.nan),
         torch.where(solved.unsqueeze(-1), wrench, torch.nan),
         status,
         residual,

@@ -1,0 +1,118 @@
+"""The compiled march against the torch step, which is the definition: values and Jacobians of the discrete steps, to round-off.
+
+Whoever changes torchrod/step.py or torchrod/tendons.py without kernel.cpp fails here.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.robots import T, busy_robot, steel_rod
+from torchrod import (
+    FourierCoordinates,
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PointForces,
+    PointWrenches,
+    Robot,
+    Rod,
+    fast,
+    forward_jacobian,
+    solve_shape,
+)
+
+needs_compiler = pytest.mark.skipif(fast.library() is None, reason="no C++ compiler on this machine: there is only the torch path")
+TENSION = T([[3.0, 2.0], [1.0, 4.0], [0.0, 7.0]], dtype=torch.float64)
+
+
+def stiffened() -> Robot:
+    """Full stiffness matrices, a pre-curved rod, gravity."""
+    K_bt = T([[0.04, 0.004, 0.001], [0.004, 0.05, 0.002], [0.001, 0.002, 0.03]])
+    curved = T([[0.0, 0.5, -1.0, 2.0], [0.4, -1.0, 0.0, 1.0]])
+    rod = Rod.from_stiffness(0.4, torch.diag(T([2e4, 3e4, 5e4])) + 100.0, K_bt, 0.1, curved)
+    return Robot(rod, gravity=T([3.0, -5.0, 6.0]))
+
+
+def close(a: torch.Tensor, b: torch.Tensor) -> bool:
+    return bool((a - b).abs().max() <= 1e-10 * b.abs().max())
+
+
+@needs_compiler
+@pytest.mark.parametrize("registration", [False, True], ids=["", "registration"])
+@pytest.mark.parametrize("loads", ["one gaussian", "three gaussians", "fourier"])
+@pytest.mark.parametrize("kind", ["passive", "tendons and gravity", "full stiffness"])
+def test_values_and_jacobians(kind, loads, registration):
+    """model.linearized, which marches in the kernel, against forward_jacobian of the torch model."""
+    robot = {"passive": steel_rod, "tendons and gravity": busy_robot, "full stiffness": stiffened}[kind]()
+    scale = robot.rod.force_scale
+    coordinates = {
+        "one gaussian": GaussianCoordinates(1, 0.4, scale),
+        "three gaussians": GaussianCoordinates(3, 0.4, scale),
+        "fourier": FourierCoordinates(3, 0.4, scale),
+    }[loads]
+    model = Model(robot, coordinates, registration, steps=10)
+    markers = Markers(T([0.1, 0.25, 0.4]), torch.zeros(3, 3, 3), 0.01 * torch.eye(3), TENSION if len(robot.tendons) else None)
+    generator = torch.Generator().manual_seed(1)
+    x = model.join(coordinates.start().expand(3, -1), torch.zeros(3, 6)) + 0.3 * torch.randn(3, model.size, generator=generator)
+    h, H = model.linearized(x, markers)
+    reference_h, reference_H = forward_jacobian(lambda x: model.h(x, markers), x)
+    assert close(h, reference_h)
+    assert close(H, reference_H)
+
+
+@needs_compiler
+def test_the_forward_solve(monkeypatch):
+    """Tip to base with every kind of known load, per-sample nodes included, with and without the kernel."""
+    robot, s = busy_robot(), T([0.1, 0.25, 0.4])
+    local = PointWrenches(T([[[0.2, 0.1, 0.3]]]), T([[[0.01, 0.02, 0.005]]]), T([0.17]), frame="local")
+    dead = PointWrenches(T([[[0.1, 0.2, -0.1]]]), T([[[0.01, -0.02, 0.01]]]), T([0.33]))
+    points = PointForces(T([[[0.3, 0.1, 0.0]], [[0.2, 0.4, 0.0]], [[0.0, 0.1, 0.0]]]), T([[0.11], [0.29], [0.4]]))
+
+    def solve():
+        return solve_shape(robot, (local, dead, points), TENSION, s, 3, 10)
+
+    compiled = solve()
+    monkeypatch.setattr(fast, "library", lambda: None)
+    plain = solve()
+    assert torch.equal(compiled.status, plain.status)
+    assert (compiled.p - plain.p).abs().max() < 1e-10
+    assert (compiled.base_wrench - plain.base_wrench).abs().max() < 1e-9
+
+
+@needs_compiler
+def test_threads_do_not_change_the_answer():
+    model = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
+    x = torch.randn(70, model.size, generator=torch.Generator().manual_seed(0)) * 0.3
+    markers = Markers(T([0.1, 0.4]), torch.zeros(70, 2, 3))
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = model.linearized(x, markers)
+        torch.set_num_threads(3)
+        three = model.linearized(x, markers)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(one[0], three[0])
+    assert torch.equal(one[1], three[1])
+
+
+def test_without_a_compiler_it_says_so_once_and_works(tmp_path):
+    code = """
+import warnings, torch
+warnings.simplefilter("always")
+from torchrod import Robot, Rod, solve_shape
+robot = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), gravity=torch.tensor([9.81, 0.0, 0.0], dtype=torch.float64))
+with warnings.catch_warnings(record=True) as seen:
+    for _ in range(2):
+        shape = solve_shape(robot, (), None, torch.tensor([0.4], dtype=torch.float64), 1, 10)
+assert shape.status[0] == 0
+assert sum("compiled march is not available" in str(w.message) for w in seen) == 1, [str(w.message) for w in seen]
+"""
+    environment = {"PATH": "/nowhere", "CXX": "/nowhere/c++", "TORCHROD_CACHE": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert not list(Path(tmp_path).glob("*.so"))
