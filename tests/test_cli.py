@@ -16,6 +16,7 @@ from torchrod.cli import main
 CASES = {case["name"]: case for case in reference("shape")}
 ROD = toml_of(CASES["passive-point-0"]["robot"], "rod")
 TENDON = toml_of(CASES["onetendon-point-0"]["robot"], "tendon robot")
+SOFT = "[rod]\nlength = 0.4\nK_se = [1, 1, 1]\nK_bt = {K_bt}\n"
 STRAIGHT = "s,x,y,z\n" + "".join(f"{0.1 * i:g},0,0,{0.1 * i:g}\n" for i in range(1, 5))
 
 
@@ -129,7 +130,36 @@ BAD = {
     "prior": (ROD, STRAIGHT, ["--load-prior", "wide"], "wide"),
     "location": (ROD, STRAIGHT, ["--location", "0.7"], "must lie on the rod"),
     "output folder": (ROD, STRAIGHT, ["--out", "/no/such/folder/r.json"], "create it first"),
-    "output suffix": (ROD, STRAIGHT, ["--out", "result.txt"], "change the suffix"),
+    "output suffix": (ROD, STRAIGHT, ["--out", "result.txt"], "end in .json or .npz"),
+    "figure suffix": (ROD, STRAIGHT, ["--plot", "figure.xyz"], "end in .png"),
+    "output is a folder": (ROD, STRAIGHT, ["--out", "folder.json"], "is a folder"),
+    "checkpoint": (ROD, STRAIGHT, ["--warm-start", "x.safetensors"], "reads no checkpoints"),
+    "noise below round-off": (ROD, STRAIGHT, ["--noise", "1e-200"], "from 1e-9 to 1"),
+    "locations twice": (ROD, STRAIGHT, ["--location", "0.2", "0.2"], "give it once"),
+    "locations and contacts": (ROD, STRAIGHT, ["--contacts", "1", "--location", "0.1", "0.2"], "one --location per load"),
+    "huge number": (ROD.replace("length = 0.4", "length = " + "1" * 400), STRAIGHT, [], "must be finite"),
+    "asymmetric stiffness": (
+        SOFT.format(K_bt="[[1e-9, 5e-10, 0], [0, 1e-9, 0], [0, 0, 1e-9]]"),
+        STRAIGHT,
+        [],
+        "symmetric positive",
+    ),
+    "two sections": (SOFT.format(K_bt="[1, 1, 1]") + "diameter = 0.001\n", STRAIGHT, [], "either the stiffnesses or"),
+    "short curvature": (ROD + "reference_curvature = [1, 2]\n", STRAIGHT, [], "[1, 2]; it must be a list of 3 numbers"),
+    "short routing": (
+        TENDON.replace("offset = [0.007, 0.0]", "routing = [[0.1, 0.007, 0], [0.2, 0.007, 0]]"),
+        STRAIGHT,
+        [],
+        "must cover 0",
+    ),
+    "negative tension": (TENDON, "s,x,y,z,tension_1\n0.2,0,0,0.2,-1\n0.4,0,0,0.4,-1\n", [], "can only pull"),
+    "offset twice": (
+        ROD,
+        "s,x,y,z,rx,ry,rz\n" + "".join(f"0.2,0,0,0.2,{r},0,0\n" for r in (0, 1, 0)),
+        [],
+        "two markers at s = 0.2",
+    ),
+    "blank lines": (ROD, "s,x,y,z\n\n\n0.1,q,0,0\n", [], "line 4, column x"),
 }
 
 
@@ -137,6 +167,7 @@ BAD = {
 def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
     robot, shapes, options, words = BAD[name]
     monkeypatch.chdir(tmp_path)
+    Path("folder.json").mkdir()
     for file, content in (("robot.toml", robot), ("shapes.csv", shapes)):
         if content is not None:
             Path(file).write_text(content)
@@ -152,7 +183,11 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
     [
         (dict(s=np.array([0.1, 0.2]), positions=np.array([[{}, {}]], dtype=object)), "plain numbers"),
         (dict(s=np.array([0.1, 0.2])), "'positions' is missing"),
-        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((3, 3))), "expected (P,) and (B, P, 3)"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((3, 3))), "expected (B, P, 3)"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((1, 2, 3)), offset=np.zeros((2, 3))), "unknown array 'offset'"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.full((1, 2, 3), np.inf)), "only positions may be NaN"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((1, 2, 3)), offsets=np.zeros((3, 3))), "expected (P, 3)"),
+        (dict(s=np.array([0.1, 0.1]), positions=np.zeros((1, 2, 3))), "two markers at s = 0.1"),
         (dict(s=np.array(["a", "b"]), positions=np.zeros((1, 2, 3))), "does not hold numbers"),
         (dict(s=np.array([0.1, np.nan]), positions=np.zeros((1, 2, 3))), "not finite"),
     ],
@@ -177,7 +212,9 @@ def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
     (tmp_path / "r.toml").write_text(TENDON)
     robot, out = str(tmp_path / "r.toml"), str(tmp_path / "s.csv")
     for options, words in (
-        ([], "give 1 tensions"),
+        ([], "give one per tendon"),
+        (["--tension", "1", "--seed", "-1"], "from 0 to 2^63"),
+        (["--tension", "1", "--out", str(tmp_path / "s.npz")], "end in .csv"),
         (["--tension", "-1"], "at least 0 N"),
         (["--tension", "1", "--at", "0.1", "0.9"], "lie on the rod"),
         (["--tension", "1", "--point", "0.1", "x", "0"], "three numbers"),
@@ -186,3 +223,35 @@ def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
         assert main(["simulate", robot, "--out", out, *options]) == 2
         assert words in capsys.readouterr().err
     assert not Path(out).exists()
+
+
+def test_tension_columns_are_taken_by_their_number(tmp_path):
+    """tension_2 before tension_1 in the header, and names that look like numbers kept as they are."""
+    case = CASES["twotendon-point-1"]
+    rows = ["sample,s,tension_2,tension_1,x,y,z"]
+    for s, p in zip(case["s"], case["positions"], strict=True):
+        rows.append(",".join(["007", *(repr(v) for v in [s, case["tensions"][1], case["tensions"][0], *p])]))
+    (sample,) = run(tmp_path, toml_of(case["robot"]), "\n".join(rows), "--noise", "1e-4", "--load-prior", "point")["results"]
+    assert sample["sample"] == "007"
+    assert sample["accepted"]
+    assert abs(sample["loads"][0]["location_m"] - case["points"][0]["s"]) < 1e-3
+
+
+def test_a_sample_without_markers_is_invalid_whatever_the_count(tmp_path, capsys):
+    for count in ("0", "1", "auto"):
+        shapes = "s,x,y,z\n" + "".join(f"{0.1 * i:g},,,\n" for i in range(1, 5))
+        (sample,) = run(tmp_path, ROD, shapes, "--contacts", count, "--plot", str(tmp_path / "f.png"))["results"]
+        assert sample["status"] == "invalid"
+        assert sample["accepted"] is False
+    assert "not written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [b"PK\x03\x04 broken", b"\x93NUMPY\x01\x00", b"\xff\xfe\x00", b""])
+def test_damaged_binary_files_are_refused(tmp_path, capsys, content):
+    (tmp_path / "r.toml").write_text(ROD)
+    (tmp_path / "ok.csv").write_text(STRAIGHT)
+    (tmp_path / "bad.npz").write_bytes(content)
+    robot, bad = str(tmp_path / "r.toml"), str(tmp_path / "bad.npz")
+    assert main(["estimate", robot, bad]) == 2
+    assert main(["plot", robot, str(tmp_path / "ok.csv"), bad, "--out", str(tmp_path / "f.png")]) == 2
+    assert capsys.readouterr().err.count("\n") == 2

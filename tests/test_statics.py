@@ -193,3 +193,40 @@ def test_a_failed_sample_leaves_its_neighbours_alone():
     assert together.status[1] == Status.INVALID
     assert together.p[1].isnan().all()
     assert (together.p[[0, 3]] - alone.p).abs().max() < 1e-12
+
+
+def test_the_number_of_load_increments_does_not_matter():
+    """41 and 47 increments once ended just short of the whole load; a neighbour's increments leave a sample alone."""
+    robot, s, L = steel_rod(), T([0.2, 0.4]), T([0.4])
+
+    def solve(*forces):
+        return solve_shape(
+            robot, (PointWrenches(T(forces).unsqueeze(1), torch.zeros(len(forces), 1, 3), L),), None, s, len(forces), 100
+        )
+
+    for force in (20.0, 19.7, 20.3):
+        assert solve([force, 0.0, 0.0]).status[0] == Status.CONVERGED
+    together, alone = solve([2.0, 0.0, 0.0], [20.0, 0.0, 0.0]), solve([2.0, 0.0, 0.0])
+    assert torch.equal(together.p[0], alone.p[0])
+
+
+def test_one_load_serves_the_whole_batch():
+    """Leading dimensions broadcast: a point load of batch 1 among three samples with different tensions."""
+    robot, s = busy_robot(), T([0.2, 0.4])
+    load = PointForces(T([[[0.2, 0.1, 0.0]]]), T([[0.13]]))
+    tension = T([[3.0, 2.0], [1.0, 2.0], [0.0, 1.0]])
+    together = solve_shape(robot, (load,), tension, s, 3)
+    alone = [solve_shape(robot, (load,), tension[i : i + 1], s, 1).p[0] for i in range(3)]
+    assert (together.p - torch.stack(alone)).abs().max() < 1e-12
+
+
+def test_tendons_on_a_soft_rod():
+    """Tensions as stiff as the rod take more Newton steps; a tension that crushes the rod is not converged."""
+    rod = Rod.circular(0.1, 0.01, 1e5, 1e5 / 3)
+    robot = Robot(rod, Tendons((Tendon.straight(0.004, 0.0, 0.1),)))
+    push = PointWrenches(T([[[0.0, 0.02, 0.0]]]), torch.zeros(1, 1, 3), T([0.1]))
+    soft = solve_shape(robot, (push,), T([[1.0]]), T([0.1]), 1, 80)
+    fine = solve_shape(robot, (push,), T([[1.0]]), T([0.1]), 1, 160)
+    assert soft.status[0] == Status.CONVERGED
+    assert (soft.p - fine.p).abs().max() < 1e-6
+    assert solve_shape(robot, (), T([[9.0]]), T([0.1]), 1, 80).status[0] == Status.NOT_CONVERGED

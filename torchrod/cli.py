@@ -13,7 +13,8 @@ class _Parser(ArgumentParser):
     """Bad arguments are bad input: one line, exit status 2."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise InputError(f"{' '.join(str(message).split())} (see torchrod --help)") from ex
+        hint = "see torchrod --help; files come before options that take several values"
+        raise InputError(f"{' '.join(str(message).split())} ({hint})") from ex
 
 
 def _number_list(parser: ArgumentParser, name: str, help: str, count: int | str = "+") -> None:
@@ -26,7 +27,7 @@ def _estimate_parser() -> ArgumentParser:
     )
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz: marker positions (m), base frame")
-    parser.add_argument("--contacts", type=str, default="1", help="number of loads, or auto: as many as the data ask for")
+    parser.add_argument("--contacts", type=str, default=None, help="number of loads (1), or auto: as many as the data ask for")
     parser.add_argument(
         "--load-prior",
         type=str,
@@ -35,9 +36,7 @@ def _estimate_parser() -> ArgumentParser:
         help="what is known of the width",
     )
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
-    parser.add_argument(
-        "--warm-start", type=str, choices=["auto", "off"], default="auto", help="auto: a learned start where one fits"
-    )
+    parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits (none yet), or off")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")

@@ -1,6 +1,7 @@
 """What each command does, once its arguments are known."""
 
 import math
+import warnings
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
 from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
-from .io.result_file import check_suffix, read_fit
+from .io.result_file import RESULT_SUFFIXES, read_fit
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers, Model
 from .result import Estimate
@@ -24,6 +25,7 @@ from .statics import solve_shape
 from .status import Status
 
 MAX_CONTACTS = 3
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def _positive(name: str, value: float) -> None:
@@ -31,39 +33,49 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name} is {value}; it must be a positive number")
 
 
-def _writable(out: str | None, figure: str | None = None) -> None:
-    """Refuse before the work, not after it. A name that the writers would refuse is refused here."""
-    for path in (out, figure):
-        if path is not None and not Path(path).resolve().parent.is_dir():
-            raise InputError(f"{path}: its folder does not exist; create it first")
+def _writable(path: str | None, suffixes: tuple[str, ...]) -> None:
+    """Refuse before the work, not after it."""
+    if path is None:
+        return
+    if Path(path).suffix not in suffixes:
+        raise InputError(f"{path}: cannot write this kind of file; let its name end in {' or '.join(suffixes)}")
+    if not Path(path).resolve().parent.is_dir():
+        raise InputError(f"{path}: its folder does not exist; create it first")
+    if Path(path).is_dir():
+        raise InputError(f"{path}: is a folder; give a file name")
 
 
 def _count(options: Namespace, robot: Robot) -> int | None:
     """How many loads; None for auto."""
     L = robot.rod.length
+    contacts = options.contacts or "1"
     if options.location:
-        if options.contacts not in ("1", str(len(options.location))):
+        if options.contacts not in (None, str(len(options.location))):
             raise InputError(f"--contacts {options.contacts} but {len(options.location)} locations; give one --location per load")
         if not all(0 < s <= L for s in options.location):
             raise InputError(f"--location {options.location}: must lie on the rod, above 0 and up to {L} m")
+        if len(set(options.location)) < len(options.location):
+            raise InputError(f"--location {options.location}: two loads at one place cannot be told apart; give it once")
         return len(options.location)
-    if options.contacts == "auto":
+    if contacts == "auto":
         return None
-    if not options.contacts.isdecimal() or int(options.contacts) > 10:
-        raise InputError(f"--contacts is {options.contacts!r}; it must be auto or a number from 0 to 10")
-    return int(options.contacts)
+    if contacts not in [str(k) for k in range(11)]:
+        raise InputError(f"--contacts is {contacts!r}; it must be auto or a number from 0 to 10")
+    return int(contacts)
 
 
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot)
-    _positive("--noise", options.noise)
+    if not 1e-9 <= options.noise <= 1:
+        raise InputError(f"--noise is {options.noise}; it must be a standard deviation in metres, from 1e-9 to 1")
+    if options.warm_start not in ("auto", "off"):
+        raise InputError(f"--warm-start {options.warm_start}: this version reads no checkpoints; use auto or off")
     _positive("--steps", options.steps)
     _positive("--max-iterations", options.max_iterations)
-    _writable(options.out, options.plot)
-    if options.out:
-        check_suffix(options.out)
+    _writable(options.out, RESULT_SUFFIXES)
+    _writable(options.plot, FIGURE_SUFFIXES)
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
@@ -121,7 +133,8 @@ def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: 
 
     drawable = torch.isfinite(result.base_wrench).all(-1).nonzero().flatten().tolist()
     if not drawable:
-        raise InputError(f"{path}: no sample has a fit to draw; see the messages above")
+        warnings.warn(f"{path}: not written, because no sample has a fit to draw", stacklevel=2)
+        return
     b = drawable[0]
     draw(path, robot, result.fit(b), markers, b, f"{robot.name}, sample {samples[b]}: {result.message(b)}")
 
@@ -136,11 +149,15 @@ def simulate(options: Namespace) -> None:
     if any(not 0 <= s <= L for s in at) or any(b <= a for a, b in pairwise(at)):
         raise InputError(f"--at {at}: must increase and lie on the rod, 0 to {L} m")
     tension = options.tension or []
-    if len(tension) != T or any(not (math.isfinite(t) and t >= 0) for t in tension):
-        raise InputError(f"--tension {tension}: the robot has {T} tendons; give {T} tensions of at least 0 N")
+    if len(tension) != T:
+        raise InputError(f"--tension has {len(tension)} values but the robot has {T} tendons; give one per tendon")
+    if any(not (math.isfinite(t) and t >= 0) for t in tension):
+        raise InputError(f"--tension {tension}: must be at least 0 N and finite")
+    if not 0 <= options.seed < 2**63:
+        raise InputError(f"--seed is {options.seed}; it must be from 0 to 2^63 - 1")
     if not (math.isfinite(options.noise) and options.noise >= 0):
         raise InputError(f"--noise is {options.noise}; it must be at least 0")
-    _writable(options.out)
+    _writable(options.out, (".csv",))
     s = torch.tensor(at, dtype=DTYPE)
     tensions = torch.tensor([tension], dtype=DTYPE) if T else None
     shape = solve_shape(robot, _known_loads(options, L), tensions, s, 1)
@@ -181,6 +198,6 @@ def plot(options: Namespace) -> None:
     sample = options.sample or shapes.samples[0]
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
-    _writable(options.out)
+    _writable(options.out, FIGURE_SUFFIXES)
     fit = read_fit(options.result, sample)
     draw(options.out, robot, fit, shapes.markers, shapes.samples.index(sample), f"{robot.name}, sample {sample}")

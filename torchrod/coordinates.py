@@ -19,6 +19,7 @@ from .rod import DTYPE
 Gamma = Float[Tensor, "... n"]
 
 WIDTH_OF_PRIOR = {"point": 1 / 100, "contact": 1 / 40, "distributed": 1 / 4}  # sigma / L: 4, 10 and 100 mm on the paper's rod
+ETA_OF_RESTART = 3.0  # S(3) = 0.95
 LOG_C_STD = 1.0  # of the weak prior on log c
 WEAK_STD = 10.0  # of the priors that only keep unobservable directions finite (a load of no force has no location)
 
@@ -61,6 +62,10 @@ class LoadCoordinates(Protocol):
     @property
     def informative_priors(self) -> int:
         """How many prior entries count as data in the chi-square test."""
+        ...
+
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """The same loads with other magnitudes: where to try again when a fit is not accepted."""
         ...
 
     def describe(self, gamma: Gamma) -> LoadReport:
@@ -133,6 +138,12 @@ class GaussianCoordinates:
         std[-1] = width_std
         return mean, std.repeat(self.count) ** -2
 
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """Forces times the factor, no load closer to an end than 5 % of the rod, the prior's width."""
+        each = gamma.unflatten(-1, (self.count, self.per_load))
+        eta = each[..., 2:-1].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
+        return torch.cat([factor * each[..., :2], eta, torch.full_like(each[..., -1:], self._log_c())], -1).flatten(-2)
+
     def _log_c(self) -> float:
         name = "contact" if self.prior_name == "none" else self.prior_name
         return -math.log(2 * WIDTH_OF_PRIOR[name] ** 2)
@@ -172,6 +183,10 @@ class PaperCoordinates:
         """None."""
         return self.start(), torch.zeros(self.size, dtype=DTYPE)
 
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """Amplitudes times the factor."""
+        return (gamma.unflatten(-1, (self.count, 4)) * gamma.new_tensor([factor, factor, 1.0, 1.0])).flatten(-2)
+
     def describe(self, gamma: Gamma) -> LoadReport:
         """The net force by (13), mu and sigma."""
         each = gamma.unflatten(-1, (self.count, 4))
@@ -199,6 +214,12 @@ class PointCoordinates:
     def size(self) -> int:
         """The number of entries of gamma."""
         return self.count * self.per_load
+
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """Forces times the factor, no load closer to an end than 5 % of the rod."""
+        each = gamma.unflatten(-1, (self.count, self.per_load))
+        eta = each[..., 2:].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
+        return torch.cat([factor * each[..., :2], eta], -1).flatten(-2)
 
     def describe(self, gamma: Gamma) -> LoadReport:
         """Force, point of application, width zero."""
@@ -252,6 +273,10 @@ class FourierCoordinates:
     def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Weak."""
         return self.start(), torch.full((self.size,), WEAK_STD**-2, dtype=DTYPE)
+
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """Coefficients times the factor."""
+        return factor * gamma
 
     def describe(self, gamma: Gamma) -> LoadReport:
         """The whole series as one load: its net force, its centroid (by |f|) and the spread about it."""

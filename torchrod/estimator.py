@@ -1,7 +1,7 @@
 """Estimate loads from markers: iterate the filter on a batch until every sample has settled."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import PaperCoordinates
+from .loads import Load
 from .measurement import Markers, Model
 from .result import Estimate, make_estimate
 from .rod import DTYPE
@@ -18,6 +19,7 @@ from .status import Status
 CHUNK = 256  # samples per pass: the working set of one iteration stays in cache
 DECREMENT = 1e-3  # converged: a further step promises to lower the cost (chi^2) by less than this,
 DECREMENT_SHARE = 1e-6  # or by less than this share of it: a model that cannot explain the data need not be fitted to round-off
+RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 SETTLED = 1.0  # the cost with adapted weights is at its minimum when a step promises less than this
 
 
@@ -26,6 +28,9 @@ class Settings:
     """How the filter is run. Sigma0, Q: the variances (per entry of x) it starts from and adds at every iteration (4).
 
     step_limit: the largest change of any entry in one iteration. adaptive: residual-adaptive noise.
+    restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
+    RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
+    its force.
     """
 
     Sigma0: float | Float[Tensor, " n"] = 1.0
@@ -33,6 +38,7 @@ class Settings:
     step_limit: float = 0.6
     adaptive: bool = True
     max_iterations: int = 100
+    restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
 
 
 def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
@@ -44,15 +50,18 @@ def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Setting
     assert isinstance(model.coordinates, PaperCoordinates)
     size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
     size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
-    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, 500)
+    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, 500, ())
+
+
+def equilibrium_wrench(model: Model, loads: tuple[Load, ...], markers: Markers) -> Float[Tensor, "B 6"]:
+    """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found."""
+    shape = solve_shape(model.robot, loads, markers.tension, markers.s[-1:], len(markers.positions), model.steps)
+    return shape.base_wrench.nan_to_num(0.0)
 
 
 def cold_start(model: Model, markers: Markers) -> Float[Tensor, "B n"]:
     """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
-    B = len(markers.positions)
-    rest = solve_shape(model.robot, (), markers.tension, markers.s[-1:], B, model.steps)
-    alpha = rest.base_wrench.nan_to_num(0.0)
-    return model.join(model.coordinates.start().expand(B, -1), alpha)
+    return model.join(model.coordinates.start().expand(len(markers.positions), -1), equilibrium_wrench(model, (), markers))
 
 
 @dataclass(frozen=True)
@@ -79,11 +88,15 @@ def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[
 
 
 def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
-    """Samples with at least as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
-    enough = 3 * markers.present.sum(-1) >= model.size - 6
+    """Samples with a marker, as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
+    enough = 3 * markers.present.sum(-1) >= max(model.size - 6, 1)
     if markers.tension is not None:
         enough = enough & torch.isfinite(markers.tension).all(-1)
     return enough
+
+
+def _silent(_: int) -> None:
+    """No progress bar."""
 
 
 def _limited(step: Float[Tensor, "B n"], limit: float) -> Float[Tensor, "B n"]:
@@ -92,7 +105,9 @@ def _limited(step: Float[Tensor, "B n"], limit: float) -> Float[Tensor, "B n"]:
     return step * (limit / step.abs().amax(-1, keepdim=True).clamp(min=1e-300)).clamp(max=1.0)
 
 
-def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"]) -> Estimate:
+def _filter(
+    model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"], progress: Callable[[int], object]
+) -> Estimate:
     """Iterate one chunk. Samples leave the batch when they have converged; a failed one never touches its neighbours."""
     w = model.weights(markers, noise)
     diagonal = torch.ones(model.size, dtype=x.dtype)
@@ -128,8 +143,28 @@ def _filter(model: Model, markers: Markers, noise: float, settings: Settings, x:
         before[live] = torch.where(finite.unsqueeze(-1), x[live], before[live])
         x[live] = torch.where(done.unsqueeze(-1), x[live], onward)
         Sigma[live] = torch.where(fresh[:, None, None], Sigma_next, Sigma0)
+        progress(int(done.sum()))
         live = live[~done]
+    progress(len(live) + int((~ok).sum()))
     return make_estimate(model, markers, x, linearize(model, x, markers, w), status, iterations)
+
+
+def _with_restarts(
+    model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"], progress: Callable[[int], object]
+) -> Estimate:
+    """One chunk, and again from other magnitudes where the fit is not accepted."""
+    fit = _filter(model, markers, noise, settings, x, progress)
+    again = replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS))
+    for factor in settings.restarts if model.coordinates.size else ():
+        index = (~fit.accepted & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
+        if not len(index):
+            break
+        part = markers.take(index)
+        gamma = model.coordinates.rescaled(fit.x[index, : model.coordinates.size], factor)
+        alpha = equilibrium_wrench(model, model.coordinates.loads(gamma), part)
+        other = _filter(model, part, noise, again, model.join(gamma, alpha), _silent)
+        fit = fit.improved_by(other, index)
+    return fit
 
 
 def estimate(
@@ -138,11 +173,11 @@ def estimate(
     noise: float,
     settings: Settings | None = None,
     start: Callable[[Model, Markers], Float[Tensor, "B n"]] = cold_start,
-    progress: Callable[[int], object] | None = None,
+    progress: Callable[[int], object] = _silent,
 ) -> Estimate:
     """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
 
-    noise: standard deviation of a marker coordinate (m). start: initial x. progress: called with the number of samples finished.
+    noise: standard deviation of a marker coordinate (m). start: initial x. progress: called as samples finish, with their number.
     A sample's answer does not depend on its batch. Errors: ValueError for markers that do not fit the robot; a sample that cannot
     be estimated is reported by its status. Source: the paper, section II; DESIGN.md section 3.
     """
@@ -151,9 +186,7 @@ def estimate(
     for first in range(0, len(markers.positions), CHUNK):
         index = torch.arange(first, min(first + CHUNK, len(markers.positions)))
         part = markers.take(index)
-        parts.append(_filter(model, part, noise, settings or Settings(), start(model, part)))
-        if progress is not None:
-            progress(len(index))
+        parts.append(_with_restarts(model, part, noise, settings or Settings(), start(model, part), progress))
     return Estimate.cat(parts)
 
 

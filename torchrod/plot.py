@@ -124,7 +124,12 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
     axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, label="clamp")
     everything = torch.cat([scene.line, seen, scene.tails, scene.envelope])
     _equal_axes(axes, everything)
-    _look_across(axes, torch.cat([scene.line[-1:] - scene.line[:1], scene.points - scene.tails]))
+    chord = scene.line[-1] - scene.line[0]
+    off_chord = scene.line - scene.line[0]
+    off_chord = off_chord - (off_chord @ chord / (chord @ chord)).unsqueeze(-1) * chord
+    bulge = off_chord[off_chord.norm(dim=-1).argmax()]
+    bent = [bulge] if bulge.norm() > 0.02 * chord.norm() else []
+    _look_across(axes, torch.cat([torch.stack([chord, *bent]), scene.points - scene.tails]))
     axes.set_title(textwrap.fill(title, 80), fontsize=12)
     for (x, y, z), text in labels:
         axes.text(x, y, z, text, color=LOAD, fontsize=11, fontweight="bold", ha="center", va="bottom")

@@ -1,7 +1,7 @@
 """The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -26,11 +26,13 @@ ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
 class Estimate:
     """Everything known of B samples after the fit. Status codes are torchrod.Status; SI units; forces in the section frame.
 
-    x, covariance: the state in the model's coordinates and its posterior (H^T W H + P)^-1 with the true noise.
+    x, covariance: the state in the model's coordinates and its posterior (H^T W H + P)^-1 with the true noise; covariances are NaN
+    where the fit has not converged.
     force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
     net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
     base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line (B, P, 3) m: the fitted rod at the markers,
     in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
+    iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, from other magnitudes.
     chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
     """
 
@@ -49,6 +51,7 @@ class Estimate:
     dof: Int[Tensor, " B"]
     accepted: Bool[Tensor, " B"]
     iterations: Int[Tensor, " B"]
+    restarts: Int[Tensor, " B"]
     status: Int[Tensor, " B"]
 
     @property
@@ -91,6 +94,19 @@ class Estimate:
         return Fit(
             self.force[sample][there], self.location[sample][there], self.width[sample][there], self.base_wrench[sample], zeta
         )
+
+    def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
+        """With the samples of `index` replaced by those of another attempt where its cost is lower; every attempt is counted."""
+        better = other.chi2 < self.chi2[index].nan_to_num(torch.inf)
+        changed = {}
+        for f in fields(Estimate):
+            value = getattr(self, f.name)
+            if value is not None:
+                changed[f.name] = value.clone()
+                changed[f.name][index[better]] = getattr(other, f.name)[better]
+        changed["iterations"] = self.iterations.index_add(0, index, other.iterations)
+        changed["restarts"] = self.restarts.index_add(0, index, torch.ones_like(index))
+        return replace(self, **changed)
 
     @staticmethod
     def cat(parts: list["Estimate"]) -> "Estimate":
@@ -153,6 +169,10 @@ def make_estimate(
     def kept(value: Tensor) -> Tensor:
         return torch.where(valid.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
 
+    def settled(value: Tensor) -> Tensor:
+        """A spread only where the fit has settled: elsewhere it would look like knowledge."""
+        return torch.where((status == int(Status.CONVERGED)).reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
+
     gamma, zeta, alpha = model.split(x)
     report: LoadReport = model.coordinates.describe(gamma)
     covariance = ekf.posterior(at.A)
@@ -162,11 +182,11 @@ def make_estimate(
     residual = at.r[:, :-6].unflatten(-1, (-1, 3))
     return Estimate(
         x=kept(x),
-        covariance=kept(covariance),
+        covariance=settled(covariance),
         force=kept(report.force),
         location=kept(report.location),
         width=kept(report.width),
-        load_covariance=kept(load_covariance(model, x, covariance)),
+        load_covariance=settled(load_covariance(model, x, covariance)),
         net_force=kept(report.net_force),
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
@@ -176,5 +196,6 @@ def make_estimate(
         dof=dof,
         accepted=(at.cost < limit) & (status == int(Status.CONVERGED)),
         iterations=iterations,
+        restarts=torch.zeros_like(iterations),
         status=status,
     )

@@ -14,7 +14,7 @@ from .tendons import Tendons
 
 @dataclass(frozen=True)
 class Robot:
-    """A rod with tendons in a gravity field. gravity: (..., 3), m/s^2, base frame."""
+    """A rod with tendons in a gravity field. gravity: (3,) or (B, 3), m/s^2, base frame."""
 
     rod: Rod
     tendons: Tendons = field(default_factory=Tendons)

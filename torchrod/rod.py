@@ -17,15 +17,15 @@ class Rod:
     """A straight or pre-curved rod of uniform section, clamped at s = 0, leaving the base frame along +z.
 
     Constitutive law in the section frame: n = K_se (v - e3), m = K_bt (u - u*).
-    length: L (m). K_se: shear and axial stiffness (..., 3, 3), N. K_bt: bending and torsion stiffness (..., 3, 3), N m^2.
-    mass_per_length: (...), kg/m. reference_curvature: rows [s, u*_x, u*_y, u*_z] (m, 1/m), linear in between; one row is constant.
-    Leading dimensions of the tensors broadcast with the batch. Source: Rucker & Webster 2011, eq. (4)-(6).
+    length: L (m). K_se: shear and axial stiffness (3, 3), N. K_bt: bending and torsion stiffness (3, 3), N m^2.
+    mass_per_length: kg/m. reference_curvature: rows [s, u*_x, u*_y, u*_z] (m, 1/m), linear in between; one row is constant.
+    One rod serves the whole batch. Source: Rucker & Webster 2011, eq. (4)-(6).
     """
 
     length: float
-    K_se: Matrix
-    K_bt: Matrix
-    mass_per_length: Float[Tensor, "..."]
+    K_se: Float[Tensor, "3 3"]
+    K_bt: Float[Tensor, "3 3"]
+    mass_per_length: Float[Tensor, ""]
     reference_curvature: Float[Tensor, "rows 4"]
 
     @classmethod
@@ -64,7 +64,7 @@ class Rod:
     @property
     def bending_stiffness(self) -> float:
         """EI (N m^2): the geometric mean of the two bending stiffnesses, the rod's scale of stiffness."""
-        return float((self.K_bt[..., 0, 0] * self.K_bt[..., 1, 1]).mean().sqrt())
+        return float((self.K_bt[0, 0] * self.K_bt[1, 1]).sqrt())
 
     @property
     def force_scale(self) -> float:

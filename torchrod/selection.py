@@ -53,7 +53,7 @@ def select_count(
     for model in models:
         if 3 * len(markers.s) < model.size - 6:
             break
-        with bar(len(markers.positions), f"{model.coordinates.size} load unknowns") as b:
+        with bar(len(markers.positions), f"count {len(fits)}") as b:
             fits.append(estimate(model, markers, noise, settings, progress=b.update))
     if not fits:
         raise ValueError(f"{len(markers.s)} markers are too few; add markers")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import roma
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .grid import DEFAULT_STEPS, Grid, make_grid
@@ -20,6 +20,7 @@ from .march import march, march_linearized, states_at
 from .robot import Robot
 from .status import Status
 from .step import STATE_PARTS, Section, StageTable, State, section_wrench
+from .tendons import strains_settled
 
 ORIENTATION_TOLERANCE = 1e-11  # rad: the forward solve's residual, far below what RK4 leaves
 INCREMENT_TOLERANCE = 1e-3  # rad: enough on the way to the full load
@@ -33,7 +34,8 @@ def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, ".
     integrals = total(loads, s, inside) + robot.weight_beyond(s)
     tendons = None
     if len(robot.tendons) and tension is not None:
-        tendons = robot.tendons.table(s, inside, tension[..., None, None, :])
+        newton = robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension)
+        tendons = robot.tendons.table(s, inside, tension[..., None, None, :], newton)
     return StageTable(integrals, robot.rod.curvature_at(s), tendons)
 
 
@@ -162,7 +164,7 @@ def turned(w: Vector, q: Quaternion) -> Quaternion:
 
 
 def _newton(
-    problem: _TipProblem, q: Quaternion, fraction: Float[Tensor, " B"]
+    problem: _TipProblem, q: Quaternion, fraction: Float[Tensor, " B"], mine: Bool[Tensor, " B"]
 ) -> tuple[Quaternion, Float[Tensor, " B"], Int[Tensor, " B"]]:
     """Damped Newton on the tip's orientation: the best orientation, its residual (rad) and the iterations taken."""
     best = torch.full_like(fraction, torch.inf)
@@ -175,7 +177,7 @@ def _newton(
         better = size < best
         anchor, turn = torch.where(better.unsqueeze(-1), q, anchor), torch.where(better.unsqueeze(-1), step, turn)
         best, damping = torch.where(better, size, best), torch.where(better, 1.0, 0.5 * damping)
-        active = (best > tolerance) & torch.isfinite(best) & (damping > 1e-3)
+        active = mine & (best > tolerance) & torch.isfinite(best) & (damping > 1e-3)
         iterations = iterations + active
         if not active.any():
             break
@@ -226,8 +228,12 @@ def solve_shape(
     if table.loads.Wn is not None or table.loads.Wm is not None:
         increments = _increments(robot, table, batch)
         for k in range(1, int(increments.max()) + 1):
-            q, residual, more = _newton(problem, q, (k / increments).clamp(max=1.0).to(one.dtype))
-            iterations = iterations + more
+            # A sample that carries its whole load is left alone, so that what its neighbours still need does not touch it.
+            mine = k <= increments
+            fraction = torch.where(k >= increments, one, k / increments.to(one.dtype))
+            turned_further, missed, more = _newton(problem, q, fraction, mine)
+            q = torch.where(mine.unsqueeze(-1), turned_further, q)
+            residual, iterations = torch.where(mine, missed, residual), iterations + more
     return _equilibrium(problem, q, residual, iterations, outputs)
 
 
@@ -246,7 +252,11 @@ def _equilibrium(
     n0, m0 = section_wrench(q[:, -1], N[:, -1], M[:, -1], problem.section.e3, base)
     wrench = torch.cat([rotate(q[:, -1], n0), rotate(q[:, -1], m0)], -1)
     finite = torch.isfinite(states).flatten(1).all(-1)
-    solved = finite & (residual <= 10 * ORIENTATION_TOLERANCE)
+    at_base = problem.table.step(0).stage(0)
+    balanced = strains_settled(
+        problem.section.K_se, problem.section.K_bt, problem.section.e3, at_base.u_star, n0, m0, at_base.tendons
+    )
+    solved = finite & balanced & (residual <= 10 * ORIENTATION_TOLERANCE)
     status = torch.full_like(iterations, int(Status.NOT_CONVERGED))
     status = torch.where(solved, int(Status.CONVERGED), torch.where(finite, status, int(Status.INVALID)))
     keep = solved[:, None, None]

@@ -1,4 +1,6 @@
-"""One arc-length step of the rod: the only place where the statics of the section is written.
+"""One arc-length step of the rod: the definition of the section's statics, with the strain balance of torchrod.tendons.
+
+(torchrod/fast/kernel.cpp is its compiled copy; tests/test_fast.py fails when the two differ.)
 
 The state is y = [p (m), q, N~ (N), M~ (N m)], (..., 13): position and orientation of the section in the base frame, and its
 wrench in the section frame with the applied loads taken out,
@@ -63,7 +65,7 @@ class StageTable:
         return StageTable(
             LoadIntegrals(at(loads.G), at(loads.G2), at(loads.Gm), at(loads.Wn), at(loads.Wm)),
             function(self.u_star),
-            None if t is None else TendonTable(function(t.L, 3), function(t.dr, 2), function(t.tau)),
+            None if t is None else TendonTable(function(t.L, 3), function(t.dr, 2), function(t.tau), t.newton),
         )
 
     def step(self, i: int) -> "StageTable":

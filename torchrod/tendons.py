@@ -1,17 +1,22 @@
 """Tendons: where they run in the section, where they end, and the strains they leave for the rod to carry."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from .lie import Matrix, Vector, hat, inverse3, matvec
 from .rod import DTYPE
 
-NEWTON_STEPS = 3  # from the unstrained section the error goes 1e-2, 1e-5, 1e-10 relative; one more, differentiated, step follows
+NEWTON_STEPS = (
+    3  # stiff rods: from the unstrained section the error goes 1e-2, 1e-5, 1e-10 relative; one more step is differentiated
+)
+NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stiffness
+SOFT = 0.1  # this much of it
+SETTLED = 1e-7  # relative change of the strains that further steps may still make
 Strains = Float[Tensor, "... 6"]
 
 
@@ -50,11 +55,13 @@ class TendonTable:
     """Every tendon at given arc lengths, for strains x = [v, u] (..., 6).
 
     along_j = L_j x + r'_j with L_j = [I, -hat(r_j)]: L (..., T, 3, 6), dr (..., T, 3); tau (..., T) N, zero past a tendon's end.
+    newton: how many steps the strain balance takes.
     """
 
     L: Float[Tensor, "... T 3 6"]
     dr: Float[Tensor, "... T 3"]
     tau: Float[Tensor, "... T"]
+    newton: int = NEWTON_STEPS
 
 
 @dataclass(frozen=True)
@@ -71,13 +78,22 @@ class Tendons:
         """Arc lengths (m) at which tendons end: step boundaries of the integration."""
         return tuple(t.ends_at for t in self.tendons)
 
-    def table(self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."], tension: Float[Tensor, "..."]) -> TendonTable:
+    def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
+        """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""
+        reach = max(max(x * x + y * y for _, x, y in t.routing) for t in self.tendons)
+        pull = tension.detach().nan_to_num(0.0).sum(-1).max()
+        ratio = pull / K_se.diagonal(dim1=-2, dim2=-1).min() + pull * reach / K_bt.diagonal(dim1=-2, dim2=-1).min()
+        return NEWTON_STEPS if bool(ratio < SOFT) else NEWTON_STEPS_SOFT
+
+    def table(
+        self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."], tension: Float[Tensor, "..."], newton: int = NEWTON_STEPS
+    ) -> TendonTable:
         """Offsets and tensions at s; `inside` is a point of the same step and decides on which side of a tendon's end s lies."""
         offsets = [t.offset_at(s) for t in self.tendons]
         r, dr = torch.stack([r for r, _ in offsets], -2), torch.stack([dr for _, dr in offsets], -2)
         active = inside.detach().unsqueeze(-1) < torch.tensor(self.ends, dtype=DTYPE)
         L = torch.cat([torch.eye(3, dtype=DTYPE).expand(*r.shape, 3), -hat(r)], -1)
-        return TendonTable(L, dr, tension * active)
+        return TendonTable(L, dr, tension * active, newton)
 
 
 def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "... T 6"], Float[Tensor, "... T 1"]]:
@@ -138,13 +154,26 @@ def balanced_strains(
 
     w = torch.cat([N, M], -1)
     w0, K_se0, K_bt0 = w.detach(), K_se.detach(), K_bt.detach()
-    frozen = TendonTable(table.L, table.dr, table.tau.detach())
+    frozen = TendonTable(table.L, table.dr, table.tau.detach(), table.newton)
     LtL = (table.L.unsqueeze(-1) * table.L.unsqueeze(-2)).sum(-3)
     x, inverse = x_star, x_star
-    for _ in range(NEWTON_STEPS):
+    for _ in range(table.newton):
         g, stretch = tendon_directions(x, frozen)
         inverse = balance_inverse(K_se0, K_bt0, frozen.tau, LtL, g, stretch)
         x = x + (inverse * misfit(x, w0, g, frozen.tau, K_se0, K_bt0).unsqueeze(-2)).sum(-1)
     g, _ = tendon_directions(x, frozen)
     x = x + (inverse * misfit(x, w, g, table.tau, K_se, K_bt).unsqueeze(-2)).sum(-1)
     return x[..., :3], x[..., 3:]
+
+
+def strains_settled(
+    K_se: Matrix, K_bt: Matrix, v_star: Vector, u_star: Vector, N: Vector, M: Vector, table: TendonTable | None
+) -> Bool[Tensor, "..."]:
+    """Whether further Newton steps would leave the strains where they are: false where the tendons crush the rod (no solution)."""
+    if table is None:
+        return torch.isfinite(N).all(-1)
+    once, again = (
+        torch.cat(balanced_strains(K_se, K_bt, v_star, u_star, N, M, t), -1)
+        for t in (table, replace(table, newton=table.newton + NEWTON_STEPS_SOFT))
+    )
+    return ((once - again).norm(dim=-1) <= SETTLED * again.norm(dim=-1)) & (again[..., 2] > 0)

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from ..grid import Grid
 from ..step import Section, StageTable
-from ..tendons import NEWTON_STEPS
 
 SOURCE = Path(__file__).with_name("kernel.cpp")
 FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-pthread", "-Wno-psabi")
@@ -118,19 +117,22 @@ def march_linearized(
         "load_tangents": 0 if dlocal is None else dlocal.shape[-1],
         "tendons": 0 if tendons is None else tendons.tau.shape[-1],
         "outputs": P,
-        "newton": NEWTON_STEPS,
+        "newton": 0 if tendons is None else tendons.newton,
         "reverse": int(reverse),
         "own_grid": int(grid.nodes.ndim == 2),
     }
+    # Nodes that differ from sample to sample come with a batch dimension, which may be 1; the kernel wants all of it.
+    each = (lambda x: x.expand(B, *x.shape[1:])) if grid.nodes.ndim == 2 else (lambda x: x)
     tensors = {
         **{name: getattr(section, name) for name in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")},
-        **{"h": grid.h, "y0": y0, "dy0": dy0, "local": local, "dlocal": dlocal, "u_star": table.u_star, "at": keep},
+        **{"h": each(grid.h), "y0": y0, "dy0": dy0, "local": local, "dlocal": dlocal},
+        **{"u_star": each(table.u_star), "at": each(keep)},
         **{name: None if (W := getattr(loads, name)) is None else W.expand(B, S, 3, 3) for name in ("Gm", "Wn", "Wm")},
         "out": out,
         "dout": dout,
     }
     if tendons is not None:
-        tensors |= {"L": tendons.L, "dr": tendons.dr, "tau": tendons.tau.expand(B, S, 3, -1)}
+        tensors |= {"L": each(tendons.L), "dr": each(tendons.dr), "tau": tendons.tau.expand(B, S, 3, -1)}
     # The contiguous copies must outlive the call: the structure holds bare addresses.
     alive = {name: x.contiguous() for name, x in tensors.items() if x is not None}
     arguments = _March(**counts, **{name: x.data_ptr() for name, x in alive.items()})

@@ -2,6 +2,8 @@
 
 import json
 import math
+import zipfile
+import zlib
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,6 +13,8 @@ import torch
 from ..errors import InputError
 from ..result import Estimate, Fit
 from ..status import Status
+
+RESULT_SUFFIXES = (".json", ".npz")
 
 
 def _plain(value: float) -> float | None:
@@ -41,11 +45,14 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     """One sample's entry of RESULT.json."""
     wrench = [_plain(v) for v in estimate.base_wrench[b].tolist()]
     record: dict[str, object] = {
-        "sample": int(sample) if sample.isdecimal() else sample,
+        "sample": int(sample)
+        if sample.isascii() and sample.isdecimal() and len(sample) < 16 and str(int(sample)) == sample
+        else sample,
         "status": Status(int(estimate.status[b])).label,
         "accepted": bool(estimate.accepted[b]),
         "message": estimate.message(b),
         "iterations": int(estimate.iterations[b]),
+        "restarts": int(estimate.restarts[b]),
         "warm_started": False,
         "chi2": _plain(float(estimate.chi2[b])),
         "dof": int(estimate.dof[b]),
@@ -59,16 +66,11 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     return record
 
 
-def check_suffix(path: str | Path) -> None:
-    """InputError unless a result can be written under this name."""
-    if Path(path).suffix not in (".json", ".npz"):
-        raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
-
-
 def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot: str) -> None:
     """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix."""
     path = Path(path)
-    check_suffix(path)
+    if path.suffix not in RESULT_SUFFIXES:
+        raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
     if path.suffix == ".json":
         content = {"robot": robot, "results": [result_record(estimate, b, name) for b, name in enumerate(samples)]}
         path.write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -77,6 +79,12 @@ def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot
     np.savez_compressed(
         path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}
     )
+
+
+def _index(path: Path, names: list[str], sample: str) -> int:
+    if sample not in names:
+        raise InputError(f"{path}: has no sample {sample}; choose one of those estimated with --sample")
+    return names.index(sample)
 
 
 def read_fit(path: str | Path, sample: str) -> Fit:
@@ -88,22 +96,22 @@ def read_fit(path: str | Path, sample: str) -> Fit:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as file:
                 names = [str(n) for n in file["sample"]]
-                b = names.index(sample)
+                b = _index(path, names, sample)
                 values = [file[key][b] for key in ("force", "location", "width", "base_wrench", "registration") if key in file]
         else:
             results = json.loads(path.read_text(encoding="utf-8"))["results"]
             names = [str(r["sample"]) for r in results]
-            record = results[names.index(sample)]
+            record = results[_index(path, names, sample)]
             loads, wrench = record["loads"], record["base_wrench"]
             values = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
             values.append([*wrench["force_N"], *wrench["moment_Nm"]])
             if "registration" in record:
                 values.append([*record["registration"]["translation_m"], *record["registration"]["rotation_rad"]])
-    except (KeyError, TypeError, OSError, json.JSONDecodeError) as error:
+        tensors = [torch.tensor(np.array(v, dtype=float)) for v in values]
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: is not a result of torchrod estimate ({error}); write it with --out") from None
-    except ValueError:
-        raise InputError(f"{path}: has no sample {sample}; choose one of those estimated with --sample") from None
-    tensors = [torch.tensor(np.array(v, dtype=float)) for v in values]
     there = torch.isfinite(tensors[0].reshape(-1, 2)).all(-1)
     tensors[:3] = [tensors[0].reshape(-1, 2)[there], tensors[1][there], tensors[2][there]]
     if not all(bool(torch.isfinite(t).all()) for t in tensors):

@@ -3,6 +3,7 @@
 import csv
 import math
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,7 @@ class Shapes:
 def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     """Markers from a CSV or NPZ file (docs/files.md), checked against the robot. Errors: InputError naming file and remedy."""
     path = Path(path)
-    if not path.is_file():
+    if "\0" in str(path) or not path.is_file():
         raise InputError(f"{path}: no such file; check the path")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
@@ -49,59 +50,75 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     given = 0 if markers.tension is None else markers.tension.shape[-1]
     if given != T:
         raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; give one per tendon, in N")
+    if markers.tension is not None and bool((markers.tension < 0).any()):
+        raise InputError(f"{path}: tension {float(markers.tension.min()):g} N is negative; a tendon can only pull, give at least 0")
     return Shapes(Markers(markers.s.clamp(0, L), markers.positions, markers.offsets, markers.tension), shapes.samples)
 
 
 def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: str) -> None:
     """s must increase; markers at one arc length are told apart by their offsets only."""
-    for i in range(len(s) - 1):
-        if s[i + 1] < s[i] or (s[i + 1] == s[i] and (offsets is None or np.array_equal(offsets[i], offsets[i + 1]))):
-            raise InputError(
-                f"{path}: sample {sample}: s = {s[i + 1]:g} m follows {s[i]:g} m; sort the markers so that s increases"
-            )
+    if (back := np.flatnonzero(np.diff(s) < 0)).size:
+        i = int(back[0])
+        raise InputError(f"{path}: sample {sample}: s = {s[i + 1]:g} m follows {s[i]:g} m; sort the markers so that s increases")
+    places = s[:, None] if offsets is None else np.column_stack([s, offsets])
+    unique, count = np.unique(places, axis=0, return_counts=True)
+    if (count > 1).any():
+        at = unique[count > 1][0, 0]
+        raise InputError(
+            f"{path}: sample {sample}: two markers at s = {at:g} m; keep one, tell them apart by rx,ry,rz, or let s increase"
+        )
 
 
 def _read_npz(path: Path) -> Shapes:
     try:
         with np.load(path, allow_pickle=False) as file:
             data = {key: np.asarray(file[key]) for key in file.files}
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(
-            f"{path}: is not an NPZ of plain numbers ({str(error).splitlines()[0]}); save numeric arrays only"
-        ) from None
+    except (ValueError, TypeError, AttributeError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: is not an NPZ of plain numbers ({reason}); save numeric arrays only") from None
+    expected = {"s": "(P,)", "positions": "(B, P, 3)", "tensions": "(B, T)", "offsets": "(P, 3)"}
+    for key, value in data.items():
+        if key not in expected:
+            raise InputError(f"{path}: unknown array '{key}'; known: {', '.join(expected)}")
+        if not (np.issubdtype(value.dtype, np.floating) or np.issubdtype(value.dtype, np.integer)):
+            raise InputError(f"{path}: array '{key}' does not hold numbers; save it as float64")
     for key in ("s", "positions"):
         if key not in data:
             raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
+    data = {key: value.astype(np.float64) for key, value in data.items()}
+    P, B = data["s"].size, len(data["positions"]) if data["positions"].ndim else 0
+    shapes = {
+        "s": (P,),
+        "positions": (B, P, 3),
+        "tensions": (B, *data.get("tensions", np.empty((0, 0))).shape[1:2]),
+        "offsets": (P, 3),
+    }
     for key, value in data.items():
-        if not np.issubdtype(value.dtype, np.number):
-            raise InputError(f"{path}: array '{key}' does not hold numbers")
-    s, positions = data["s"].astype(float), data["positions"].astype(float)
-    if s.ndim != 1 or positions.ndim != 3 or positions.shape[1:] != (len(s), 3):
-        raise InputError(f"{path}: shapes are s {s.shape} and positions {positions.shape}; expected (P,) and (B, P, 3)")
-    expected = {"tensions": (len(positions), None), "offsets": (len(s), 3)}
-    for key, shape in expected.items():
-        if key in data and (data[key].ndim != 2 or any(n not in (None, m) for n, m in zip(shape, data[key].shape, strict=True))):
-            raise InputError(f"{path}: array '{key}' has shape {data[key].shape}; expected {shape[0]} rows")
-    if not np.isfinite(s).all():
-        raise InputError(f"{path}: array 's' holds a value that is not finite")
-    _increasing(path, s, data.get("offsets"), "all")
-    tensor = {key: torch.from_numpy(value.astype(float)) for key, value in data.items()}
+        if value.shape != shapes[key]:
+            raise InputError(f"{path}: array '{key}' has shape {value.shape}; expected {expected[key]} with P = {P} and B = {B}")
+        if np.isinf(value).any() or (key in ("s", "offsets") and np.isnan(value).any()):
+            raise InputError(
+                f"{path}: array '{key}' holds a value that is not finite; only positions may be NaN (a missing marker)"
+            )
+    _increasing(path, data["s"], data.get("offsets"), "all")
+    tensor = {key: torch.from_numpy(value) for key, value in data.items()}
     markers = Markers(tensor["s"], tensor["positions"], tensor.get("offsets"), tensor.get("tensions"))
-    return Shapes(markers, [str(i) for i in range(len(positions))])
+    return Shapes(markers, [str(i) for i in range(B)])
 
 
 def _read_csv(path: Path) -> Shapes:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [row for row in csv.reader(file) if row]
+            reader = csv.reader(file)
+            numbered = [(reader.line_num, row) for row in reader if row]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: is not a CSV text file; expected the header s,x,y,z") from None
-    header = [name.strip() for name in rows[0]] if rows else []
+    header = [name.strip() for name in numbered[0][1]] if numbered else []
     _check_header(path, header)
-    if len(rows) < 2:
+    if len(numbered) < 2:
         raise InputError(f"{path}: has a header but no rows; give one row per marker")
     samples: dict[str, list[dict[str, float]]] = {}
-    for number, row in enumerate(rows[1:], start=2):
+    for number, row in numbered[1:]:
         if len(row) != len(header):
             raise InputError(
                 f"{path}: line {number} has {len(row)} cells, the header {len(header)}; leave a missing marker's cells empty"
@@ -144,7 +161,7 @@ def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, f
     """One marker list for all samples, in the order of s; a marker that a sample does not have is missing there."""
     has_offsets = OFFSETS[0] in header
     keys = ("s", *OFFSETS) if has_offsets else ("s",)
-    tensions = [name for name in header if name.startswith("tension_")]
+    tensions = [f"tension_{i + 1}" for i in range(sum(name.startswith("tension_") for name in header))]
     for name, rows in samples.items():
         at = np.array([[row[k] for k in keys] for row in rows])
         _increasing(path, at[:, 0], at[:, 1:] if has_offsets else None, name)
