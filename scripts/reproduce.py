@@ -1,0 +1,43 @@
+"""Studies of the paper beside ours: python scripts/reproduce.py [study1] [coverage] [--quick] [--json FILE] [--out FOLDER].
+
+Each part is a module in scripts/reproduction with run(quick, folder) -> (figures as data, lines of Markdown). The parts that ran
+are written to FOLDER/reproduction.md (docs/ by default) with their pictures, and to FILE as JSON.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from reproduction import coverage, study1
+
+PARTS = {"study1": study1, "coverage": coverage}
+HEAD = """# Reproduction
+
+Made by `python scripts/reproduce.py`. The paper's studies beside ours; every row is computed when the command runs.
+"""
+
+
+def main() -> None:
+    """Run the named parts, or all, and write what they found."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="which parts; all by default")
+    parser.add_argument("--quick", action="store_true", help="fewer cases, under a minute")
+    parser.add_argument("--json", type=Path, help="write the figures as data")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs", help="folder of page and pictures"
+    )
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    data, page = {}, [HEAD]
+    for name in options.parts or PARTS:
+        print(f"{name} ...", flush=True)
+        data[name], lines = PARTS[name].run(options.quick, options.out)
+        page += lines
+        (options.out / "reproduction.md").write_text("\n".join(page), encoding="utf-8")
+        if options.json:
+            options.json.write_text(json.dumps(data, indent=1), encoding="utf-8")
+    print("\n".join(page))
+
+
+if __name__ == "__main__":
+    main()

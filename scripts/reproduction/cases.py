@@ -1,0 +1,68 @@
+"""Study 1 of the paper: point loads of 0.5 to 1 N, 10 to 39 cm along a 0.4 m steel rod, 20 markers. And its Cramer-Rao bound."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrod import Estimate, GaussianCoordinates, Markers, Model, PointForces, Robot, Rod, estimate, solve_shape
+
+L = 0.4
+S = torch.linspace(0.02, L, 20, dtype=torch.float64)
+
+
+def steel_rod() -> Robot:
+    """The paper's rod: 1.4 mm spring steel."""
+    return Robot(Rod.circular(L, 0.0014, 207e9, 79e9))
+
+
+@dataclass(frozen=True)
+class Study:
+    """True loads and the shapes they make: force (B, 2) N, location (B,) m, positions (B, 20, 3) m, base wrench (B, 6)."""
+
+    robot: Robot
+    force: Tensor
+    location: Tensor
+    positions: Tensor
+    base_wrench: Tensor
+
+    def noisy(self, noise: float, seed: int) -> Markers:
+        """Markers with Gaussian noise (m) on every coordinate."""
+        generator = torch.Generator().manual_seed(seed)
+        return Markers(S, self.positions + noise * torch.randn(self.positions.shape, generator=generator, dtype=torch.float64))
+
+    def estimate(self, markers: Markers, sigma: float, prior: str) -> Estimate:
+        """The default estimator with a width prior."""
+        return estimate(Model(self.robot, GaussianCoordinates(1, L, self.robot.rod.force_scale, prior)), markers, sigma)
+
+    def bound(self, noise: float, width_known: bool) -> tuple[Tensor, Tensor]:
+        """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N), alpha unknown, for a load 1 mm wide.
+
+        (H^T W H)^-1 at the truth, without any prior; with the width unknown its column stays in.
+        """
+        robot = self.robot
+        model = Model(robot, GaussianCoordinates(1, L, robot.rod.force_scale, "none"))
+        t = self.location / L
+        log_c = torch.full_like(t, math.log(0.5 * (L / 1e-3) ** 2))
+        gamma = torch.cat([self.force / robot.rod.force_scale, torch.logit(t).unsqueeze(-1), log_c.unsqueeze(-1)], -1)
+        markers = Markers(S, self.positions)
+        _, H = model.linearized(model.join(gamma, self.base_wrench), markers)
+        if width_known:
+            H = torch.cat([H[..., :3], H[..., 4:]], -1)
+        w = model.weights(markers, noise)
+        C = torch.linalg.inv(H.mT @ (w.unsqueeze(-1) * H))
+        along = self.force / self.force.norm(dim=-1, keepdim=True)
+        magnitude = (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten().sqrt() * robot.rod.force_scale
+        return C[:, 2, 2].sqrt() * L * t * (1 - t), magnitude
+
+
+def study1(count: int, seed: int = 0) -> Study:
+    """`count` random cases; their shapes with 160 steps and exact point loads, from tip to base."""
+    generator = torch.Generator().manual_seed(seed)
+    size, angle, place = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    size, angle, place = 0.5 + 0.5 * size, 2 * math.pi * angle, 0.1 + 0.29 * place
+    force = torch.stack([size * angle.cos(), size * angle.sin(), 0 * size], -1)
+    robot = steel_rod()
+    shape = solve_shape(robot, (PointForces(force.unsqueeze(1), place.unsqueeze(1)),), None, S, count, 160)
+    return Study(robot, force[:, :2], place, shape.p, shape.base_wrench)

@@ -1,0 +1,116 @@
+"""Study 1: one point load, with and without noise: convergence, iterations, errors, efficiency, and errors along the rod."""
+
+import time
+from pathlib import Path
+
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from torchrod import Estimate, Model, PaperCoordinates, Status, estimate, paper_settings
+
+from .cases import L, Study, study1
+
+NOISE = 1e-3
+ROWS = {"clean": (0.0, 1e-4), "noise_1mm": (NOISE, NOISE)}  # noise added, noise told
+PAPER = {"clean": "94 %, 91 iterations, 2.1 s each; 3.5 mm, 0.08 N", "noise_1mm": "20.1 mm, 0.53 N"}
+
+
+def figures_of(fit: Estimate, study: Study, seconds: float) -> dict[str, float]:
+    """Means over the samples that converged; errors of magnitude and location."""
+    done = fit.status == Status.CONVERGED
+    location = (fit.location[:, 0] - study.location).abs()[done]
+    force = (fit.magnitude[:, 0] - study.force.norm(dim=-1)).abs()[done]
+    result = {"converged": float(done.double().mean()), "accepted": float(fit.accepted.double().mean())}
+    result |= {"iterations_mean": float(fit.iterations[done].double().mean()), "seconds_per_estimate": seconds / len(done)}
+    for name, error in (("location_m", location), ("force_N", force)):
+        result |= {f"{name}_mean": float(error.mean()), f"{name}_median": float(error.median()), f"{name}_rmse": _rms(error)}
+    return result
+
+
+def _rms(x: Tensor) -> float:
+    return float(x.square().mean().sqrt())
+
+
+def _paper_mode(study: Study, noise: float, sigma: float) -> tuple[Estimate, float]:
+    model = Model(study.robot, PaperCoordinates(1, L), scaled=False)
+    start = time.perf_counter()
+    fit = estimate(model, study.noisy(noise, 1), max(sigma, NOISE), paper_settings(model))
+    return fit, time.perf_counter() - start
+
+
+def run(quick: bool, folder: Path) -> tuple[dict[str, dict[str, dict[str, float]]], list[str]]:
+    """Every row of the study, its table and its figure."""
+    study = study1(20 if quick else 100)
+    study.estimate(study.noisy(0.0, 1), 1e-4, "point")  # the first call pays for compiling and caches
+    known, unknown = study.bound(NOISE, True), study.bound(NOISE, False)
+    data: dict[str, dict[str, dict[str, float]]] = {}
+    lines = [
+        "## Study 1",
+        "",
+        f"{len(study.location)} cases. The paper: {PAPER['clean']}; with 1 mm noise {PAPER['noise_1mm']}.",
+        "",
+    ]
+    errors = "location mean / median / RMSE (mm) | force mean / median / RMSE (N)"
+    lines += [f"| noise | prior | converged | accepted | iterations | {errors} | ms each |", "|---|---|---|---|---|---|---|---|"]
+    noisy: dict[str, Estimate] = {}
+    for name, (noise, sigma) in ROWS.items():
+        data[name] = {}
+        for prior in tqdm(["point", "contact", "none", "paper mode"], desc=name, delay=1.0, leave=False):
+            start = time.perf_counter()
+            if prior == "paper mode":
+                fit, seconds = _paper_mode(study, noise, sigma)
+            else:
+                fit = study.estimate(study.noisy(noise, 1), sigma, prior)
+                seconds = time.perf_counter() - start
+            row = data[name][prior] = figures_of(fit, study, seconds)
+            if noise and prior != "paper mode":
+                noisy[prior] = fit
+                row |= {
+                    "efficiency_location": row["location_m_rmse"] / _rms(known[0]),
+                    "efficiency_force": row["force_N_rmse"] / _rms(known[1]),
+                }
+            lines.append(_line(name, prior, row))
+    lines += [
+        "",
+        f"Cramer-Rao bound at 1 mm noise (RMS over the cases): width known {_rms(known[0]) * 1e3:.2f} mm, {_rms(known[1]):.4f} N; ",
+    ]
+    lines[-1] += f"width unknown {_rms(unknown[0]) * 1e3:.2f} mm, {_rms(unknown[1]):.4f} N."
+    lines += [
+        "Efficiency is RMSE over the bound for known width: " + "; ".join(_efficiency(p, data["noise_1mm"][p]) for p in noisy) + "."
+    ]
+    lines += ["", "![Errors along the rod](study1.png)", ""]
+    _figure(study, noisy, known, folder / "study1.png")
+    return data, lines
+
+
+def _line(noise: str, prior: str, row: dict[str, float]) -> str:
+    location = " / ".join(f"{1e3 * row[f'location_m_{k}']:.3f}" for k in ("mean", "median", "rmse"))
+    force = " / ".join(f"{row[f'force_N_{k}']:.4f}" for k in ("mean", "median", "rmse"))
+    share = f"{100 * row['converged']:.0f} % | {100 * row['accepted']:.0f} % | {row['iterations_mean']:.1f}"
+    return f"| {noise} | {prior} | {share} | {location} | {force} | {1e3 * row['seconds_per_estimate']:.1f} |"
+
+
+def _efficiency(prior: str, row: dict[str, float]) -> str:
+    return f"{prior} {row['efficiency_location']:.2f} (location), {row['efficiency_force']:.2f} (force)"
+
+
+def _figure(study: Study, noisy: dict[str, Estimate], bound: tuple[Tensor, Tensor], path: Path) -> None:
+    """Errors against the true location, with the bound, 1 mm noise."""
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    order = torch.argsort(study.location)
+    for k, (label, unit, scale) in enumerate((("location error", "mm", 1e3), ("force error", "N", 1.0))):
+        axes = figure.add_subplot(1, 2, k + 1)
+        for prior, colour in (("contact", "#0a7f8c"), ("point", "#c8102e")):
+            fit = noisy[prior]
+            error = fit.location[:, 0] - study.location if k == 0 else fit.magnitude[:, 0] - study.force.norm(dim=-1)
+            axes.semilogy(study.location * 1e3, error.abs() * scale, "o", ms=3.5, color=colour, label=f"{prior} prior")
+        axes.semilogy(
+            study.location[order] * 1e3, bound[k][order] * scale, color="#1b2a41", lw=1, label="Cramer-Rao bound (1 sigma)"
+        )
+        axes.set_xlabel("true location (mm)")
+        axes.set_ylabel(f"{label} ({unit}), 1 mm noise")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    figure.savefig(path, dpi=150)
