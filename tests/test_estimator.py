@@ -48,6 +48,24 @@ def test_the_reported_spread_is_the_observed_one():
     magnitude = (fit.magnitude[:, 0] - study.force.norm(dim=-1)) / fit.magnitude_std[:, 0]
     for z in (location, magnitude):
         assert 0.8 < z.square().mean().sqrt() < 1.2
+    C = fit.log_covariance[:, 0]
+    assert torch.allclose(C[:, 0, 0].sqrt(), fit.magnitude_std[:, 0] / fit.magnitude[:, 0])
+    assert torch.allclose(C[:, 2, 2].sqrt(), fit.location_std[:, 0] / fit.location[:, 0])
+    known = fit.magnitude_std < 0.4 * fit.magnitude
+    assert known.double().mean() > 0.9
+    for interval, value in ((fit.magnitude_interval, fit.magnitude), (fit.location_interval, fit.location)):
+        assert (interval[..., 0] < value).all()
+        assert torch.allclose(interval.prod(-1).sqrt()[known], value[known]), "symmetric in the logarithm where well known"
+
+
+def test_the_interval_of_a_force_that_is_not_there_reaches_zero():
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    straight = torch.zeros(1, 20, 3)
+    straight[..., 2] = s
+    fit = estimate(Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale)), Markers(s, straight), 1e-3)
+    assert fit.accepted[0]
+    assert fit.magnitude[0, 0] < fit.magnitude_std[0, 0]
+    assert fit.magnitude_interval[0, 0, 0] == 0
 
 
 def test_a_samples_answer_does_not_depend_on_its_batch():

@@ -29,6 +29,7 @@ def test_quick_reproduction(tmp_path):
     assert clean["force_N_mean"] < 1e-3
     assert noisy["iterations_mean"] < 10
     assert 0.5 < noisy["efficiency_location"] < 1.6
-    assert data["coverage"]["location_95"] > 0.88
+    for region in ("region_95", "magnitude_95", "location_95"):
+        assert data["coverage"][region] > 0.88, region
     for name in ("reproduction.md", "study1.png", "coverage.png"):
         assert (tmp_path / name).stat().st_size > 500

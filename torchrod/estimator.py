@@ -146,7 +146,7 @@ def _filter(
         progress(int(done.sum()))
         live = live[~done]
     progress(len(live) + int((~ok).sum()))
-    return make_estimate(model, markers, x, linearize(model, x, markers, w), status, iterations)
+    return make_estimate(model, markers, w, x, linearize(model, x, markers, w), status, iterations)
 
 
 def _with_restarts(

@@ -19,6 +19,7 @@ from .status import Status
 if TYPE_CHECKING:
     from .estimator import Linearized
 
+Z95 = 1.959964  # of the standard normal distribution
 ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
 
 
@@ -71,6 +72,31 @@ class Estimate:
     def location_std(self) -> Float[Tensor, "B K"]:
         """Standard deviation of the location (m)."""
         return self.load_covariance[..., 2, 2].clamp(min=0).sqrt()
+
+    @property
+    def log_covariance(self) -> Float[Tensor, "B K 3 3"]:
+        """Covariance of [log |F|, direction (rad, about the rod), log location].
+
+        A push nearer the base looks like a weaker one farther out: the region of (force, location) is a banana in newtons and
+        metres and an ellipse in their logarithms, so this is the one to build joint regions from (docs/reproduction.md).
+        """
+        size = self.magnitude.unsqueeze(-1)
+        along = self.force / size
+        across = torch.stack([-along[..., 1], along[..., 0]], -1)
+        zero = torch.zeros_like(size)
+        place = torch.cat([zero, zero, 1 / self.location.unsqueeze(-1)], -1)
+        J = torch.stack([torch.cat([along / size, zero], -1), torch.cat([across / size, zero], -1), place], -2)
+        return J @ self.load_covariance[..., :3, :3] @ J.mT
+
+    @property
+    def magnitude_interval(self) -> Float[Tensor, "B K 2"]:
+        """95 % interval of |F| (N)."""
+        return _interval(self.magnitude, self.magnitude_std)
+
+    @property
+    def location_interval(self) -> Float[Tensor, "B K 2"]:
+        """95 % interval of the location (m)."""
+        return _interval(self.location, self.location_std)
 
     @property
     def rms_residual(self) -> Float[Tensor, " B"]:
@@ -141,6 +167,15 @@ class Fit:
         return (smooth, PointForces(force[point], self.location[point]))
 
 
+def _interval(value: Float[Tensor, "B K"], std: Float[Tensor, "B K"]) -> Float[Tensor, "B K 2"]:
+    """95 %: symmetric in the logarithm where that is well known (to a factor of about e), else in the value, and not below 0."""
+    relative = std / value
+    sign = value.new_tensor([-1.0, 1.0]) * Z95
+    by_factor = value.unsqueeze(-1) * torch.exp(sign * relative.unsqueeze(-1))
+    by_difference = (value.unsqueeze(-1) + sign * std.unsqueeze(-1)).clamp(min=0)
+    return torch.where((relative < 0.5).unsqueeze(-1), by_factor, by_difference)
+
+
 def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B K 4 4"]:
     """Covariance of [F_x, F_y, location, width] per load, carried over from x by the derivative of `describe`."""
     n = model.coordinates.size
@@ -157,6 +192,7 @@ def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Ten
 def make_estimate(
     model: Model,
     markers: Markers,
+    w: Float[Tensor, "B z"],
     x: Float[Tensor, "B n"],
     at: "Linearized",
     status: Int[Tensor, " B"],
@@ -175,7 +211,7 @@ def make_estimate(
 
     gamma, zeta, alpha = model.split(x)
     report: LoadReport = model.coordinates.describe(gamma)
-    covariance = ekf.posterior(at.A)
+    covariance = ekf.posterior(ekf.information(at.H, at.r, model.exact_weights(w), x, *model.prior())[0])
     present = markers.present
     dof = 3 * present.sum(-1) + 6 + model.coordinates.informative_priors - model.size
     limit = torch.from_numpy(chi2_distribution.ppf(ACCEPT, dof.clamp(min=1).numpy()))

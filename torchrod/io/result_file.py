@@ -35,6 +35,10 @@ def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
                 "magnitude_N": _plain(float(estimate.magnitude_std[b, k])),
                 "location_m": _plain(float(estimate.location_std[b, k])),
             },
+            "interval_95": {
+                "magnitude_N": [_plain(v) for v in estimate.magnitude_interval[b, k].tolist()],
+                "location_m": [_plain(v) for v in estimate.location_interval[b, k].tolist()],
+            },
         }
         for k in range(len(force))
         if not math.isnan(force[k][0])
