@@ -11,9 +11,8 @@ from torch import Tensor
 from .lie import Matrix, Vector, hat, inverse3, matvec
 from .rod import DTYPE
 
-NEWTON_STEPS = (
-    3  # stiff rods: from the unstrained section the error goes 1e-2, 1e-5, 1e-10 relative; one more step is differentiated
-)
+# Stiff rods: values to round-off and derivatives to 1e-9 (with two steps 1e-12 and only 1e-5). One more, differentiated, follows.
+NEWTON_STEPS = 3
 NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stiffness
 SOFT = 0.1  # this much of it
 SETTLED = 1e-7  # relative change of the strains that further steps may still make
