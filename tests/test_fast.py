@@ -22,6 +22,7 @@ from torchrod import (
     Rod,
     fast,
     forward_jacobian,
+    shape_from_base,
     solve_shape,
 )
 
@@ -81,6 +82,20 @@ def test_the_forward_solve(monkeypatch):
     assert torch.equal(compiled.status, plain.status)
     assert (compiled.p - plain.p).abs().max() < 1e-10
     assert (compiled.base_wrench - plain.base_wrench).abs().max() < 1e-9
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "robot", [steel_rod(), busy_robot(), stiffened()], ids=["passive", "tendons and gravity", "full stiffness"]
+)
+def test_a_shape_without_tangents(robot):
+    """What the result and the figure draw, with loads whose places differ from sample to sample."""
+    points = PointForces(T([[[0.3, 0.1, 0.0]], [[0.2, 0.4, 0.0]], [[0.0, 0.1, 0.0]]]), T([[0.11], [0.29], [0.4]]))
+    alpha = 0.3 * torch.randn(3, 6, generator=torch.Generator().manual_seed(2))
+    tension = TENSION if len(robot.tendons) else None
+    shapes = [shape_from_base(robot, (points,), alpha, tension, T([0.1, 0.4]), 10, differentiable=d) for d in (True, False)]
+    for name in ("p", "q", "tip_residual"):
+        assert close(getattr(shapes[1], name), getattr(shapes[0], name)), name
 
 
 @needs_compiler

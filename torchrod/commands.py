@@ -13,8 +13,7 @@ from .coordinates import GaussianCoordinates
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
-from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
-from .io.result_file import RESULT_SUFFIXES, read_fit
+from .io import RESULT_SUFFIXES, Shapes, read_fit, read_robot, read_shapes, write_result, write_shapes
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers, Model
 from .result import Estimate

@@ -24,7 +24,7 @@ from .step import Section
 
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
-TIP_EXACT = 10.0
+TIP_EXACT = 10.0  # the covariance of the result takes the tip residual as this much stiffer
 TURN_SCALE = 0.1  # rad, one unit of a registration angle; a unit of translation is this part of the rod's length
 
 
@@ -90,10 +90,11 @@ class Model:
         zeta = alpha.new_zeros(alpha.shape[0], 6 * self.registration)
         return torch.cat([gamma, zeta, alpha / self.alpha_scale(alpha)], -1)
 
-    def shape(self, x: Float[Tensor, "... n"], markers: Markers) -> Shape:
+    def shape(self, x: Float[Tensor, "... n"], markers: Markers, differentiable: bool = True) -> Shape:
         """The rod at the markers' arc lengths, in its own base frame."""
         gamma, _, alpha = self.split(x)
-        return shape_from_base(self.robot, self.coordinates.loads(gamma), alpha, markers.tension, markers.s, self.steps)
+        loads = self.coordinates.loads(gamma)
+        return shape_from_base(self.robot, loads, alpha, markers.tension, markers.s, self.steps, differentiable)
 
     def h(self, x: Float[Tensor, "... n"], markers: Markers) -> Float[Tensor, "... z"]:
         """[p_1 .. p_P (m), c (N, N m)], (..., 3 P + 6): marker positions in the measured frame, then the tip residual."""
@@ -114,7 +115,7 @@ class Model:
         integrals of gamma) and after it (offsets, registration, tip residual) by torch.func. The same as forward_jacobian(h),
         which is what is used where the nodes themselves move with x (point loads at unknown places).
         """
-        gamma, _, _ = self.split(x)
+        gamma, _, alpha = self.split(x)
         loads = self.coordinates.loads(gamma)
         grid = grid_for(self.robot, loads, markers.s, self.steps)
         if grid.nodes.ndim > 1:
@@ -134,8 +135,8 @@ class Model:
         known = stage_table(self.robot, (), markers.tension, grid)
         table = replace(known, loads=known.loads + LoadIntegrals(G[..., :3], G[..., 3:]))
         dy0 = x.new_zeros(B, 13, g + 6)
-        dy0[:, range(7, 13), range(g, g + 6)] = alpha_scale = self.alpha_scale(x)
-        y0 = base_state(self.robot, x[:, -6:] * alpha_scale, table)
+        dy0[:, range(7, 13), range(g, g + 6)] = self.alpha_scale(x)
+        y0 = base_state(self.robot, alpha, table)
         section = Section.of(self.robot.rod.K_se, self.robot.rod.K_bt)
         states, tangents = march_linearized(section, y0, dy0, table, dG, grid, grid.outputs_and_tip)
         return self._after(section, states, tangents, value[:, -6:], slope[:, -6:], x, markers)

@@ -44,7 +44,7 @@ def _scene(robot: Robot, fit: Fit, tension: Tensor | None) -> _Scene:
     near = (fit.location.unsqueeze(-1) + fit.width.unsqueeze(-1) * torch.linspace(-3, 3, 25, dtype=DTYPE)).flatten().clamp(0, L)
     s = torch.cat([torch.linspace(0, L, 121, dtype=DTYPE), near, fit.location]).sort().values
     tension = None if tension is None else tension.unsqueeze(0)
-    shape = shape_from_base(robot, loads, fit.base_wrench.unsqueeze(0), tension, s, DEFAULT_STEPS)
+    shape = shape_from_base(robot, loads, fit.base_wrench.unsqueeze(0), tension, s, DEFAULT_STEPS, differentiable=False)
     p, q = shape.p[0], shape.q[0]
 
     def measured(x: Tensor) -> Tensor:

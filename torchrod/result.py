@@ -226,7 +226,7 @@ def make_estimate(
         net_force=kept(report.net_force),
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
-        centre_line=kept(model.shape(x, markers).p),
+        centre_line=kept(model.shape(x, markers, differentiable=False).p),
         residual=torch.where(present.unsqueeze(-1), kept(residual), torch.nan),
         chi2=kept(at.cost),
         dof=dof,

@@ -96,13 +96,21 @@ def shape_from_base(
     tension: Float[Tensor, "... T"] | None,
     outputs: Float[Tensor, " P"],
     steps: int,
+    differentiable: bool = True,
 ) -> Shape:
-    """March base to tip under alpha = [n(0) (N), m(0) (N m)]; outputs in m. The tip need not be in equilibrium."""
+    """March base to tip under alpha = [n(0) (N), m(0) (N m)]; outputs in m. The tip need not be in equilibrium.
+
+    differentiable=False takes the compiled march where it serves, for alpha (B, 6) outside of any transform.
+    """
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
-    states = march(section, base_state(robot, alpha, table), table, grid)
-    return shape_of(section, states_at(states, grid.outputs_and_tip), beyond_tip(robot, loads, alpha))
+    y, at = base_state(robot, alpha, table), grid.outputs_and_tip
+    if differentiable:
+        states = states_at(march(section, y, table, grid), at)
+    else:
+        states, _ = march_linearized(section, y, y.new_zeros(*y.shape, 0), table, None, grid, at)
+    return shape_of(section, states, beyond_tip(robot, loads, alpha))
 
 
 @dataclass(frozen=True)
