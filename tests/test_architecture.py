@@ -30,7 +30,7 @@ LAYERS = [
     {"lie", "jacobian", "status", "errors"},
 ]
 
-PACKAGES = ("io", "fast")
+PACKAGES = ("io", "fast", "coordinates")
 
 
 def imports_of(path: Path) -> set[str]:
