@@ -6,6 +6,8 @@ leaves nothing behind but a shard to be computed again.
 
 import contextlib
 import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -37,7 +39,7 @@ def produce(
             made = _as_they_come(executor, width, spec, indices)
         elif min(workers, len(indices)) > 1:
             # spawn: a fork would inherit torch's thread pool in the middle of whatever it does
-            executor = ProcessPoolExecutor(min(workers, len(indices)), multiprocessing.get_context("spawn"))
+            executor = ProcessPoolExecutor(min(workers, len(indices)), multiprocessing.get_context("spawn"), _leave_with_parent)
             stack.callback(executor.shutdown, cancel_futures=True)
             made = _as_they_come(executor, lambda: 2 * workers, spec, indices)
         else:
@@ -45,6 +47,18 @@ def produce(
         for index, arrays in made:
             write_shard(folder, spec, index, arrays)
             progress(spec.samples_in(index))
+
+
+def _leave_with_parent() -> None:
+    """End this worker process when the command is killed: the pool itself would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _as_they_come(executor: Executor, width: Callable[[], int], spec: DatasetSpec, indices: list[int]) -> Made:
