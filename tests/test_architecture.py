@@ -16,10 +16,11 @@ SCRIPTS = sorted((ROOT / "scripts").rglob("*.py")) + sorted((ROOT / "training").
 LAYERS = [
     {"cli"},
     {"commands"},
+    {"production"},
     {"io", "plot", "selection"},
     {"estimator"},
     {"result"},
-    {"ekf", "measurement"},
+    {"ekf", "measurement", "dataset"},
     {"coordinates", "statics"},
     {"march"},
     {"fast"},

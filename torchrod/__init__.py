@@ -10,9 +10,10 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
+    from .dataset import DatasetSpec, simulate_shard
     from .errors import InputError
     from .estimator import Settings, cold_start, estimate, paper_settings
-    from .io import Shapes, read_robot, read_shapes, write_result, write_shapes
+    from .io import Dataset, Shapes, read_dataset, read_dataset_spec, read_robot, read_shapes, write_result, write_shapes
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
     from .measurement import Markers, Model
@@ -26,9 +27,19 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
+    "dataset": ("DatasetSpec", "simulate_shard"),
     "errors": ("InputError",),
     "estimator": ("Settings", "cold_start", "estimate", "paper_settings"),
-    "io": ("Shapes", "read_robot", "read_shapes", "write_result", "write_shapes"),
+    "io": (
+        "Dataset",
+        "Shapes",
+        "read_dataset",
+        "read_dataset_spec",
+        "read_robot",
+        "read_shapes",
+        "write_result",
+        "write_shapes",
+    ),
     "jacobian": ("forward_jacobian",),
     "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),
     "measurement": ("Markers", "Model"),
@@ -41,6 +52,8 @@ _HOMES = {
     "tendons": ("Tendon", "Tendons"),
 }
 __all__ = [
+    "Dataset",
+    "DatasetSpec",
     "Equilibrium",
     "Estimate",
     "Fit",
@@ -69,9 +82,12 @@ __all__ = [
     "estimate",
     "forward_jacobian",
     "paper_settings",
+    "read_dataset",
+    "read_dataset_spec",
     "read_robot",
     "read_shapes",
     "shape_from_base",
+    "simulate_shard",
     "solve_shape",
     "write_result",
     "write_shapes",

@@ -67,6 +67,20 @@ def _simulate_parser() -> ArgumentParser:
     return parser
 
 
+def _dataset_parser() -> ArgumentParser:
+    parser = _Parser(description="Shapes of random known loads, by the million: a folder of shards that can be resumed and shared.")
+    parser.add_argument("spec", type=str, help="DATASET.toml: robots, loads and markers to draw from")
+    parser.add_argument("--out", type=str, required=True, help="FOLDER; shards that are there and sound are kept")
+    parser.add_argument("--samples", type=int, default=None, help="number of samples, instead of the file's")
+    parser.add_argument("--seed", type=int, default=None, help="instead of the file's")
+    parser.add_argument("--shard", type=str, default=None, metavar="I/N", help="only shards I, I + N, ...: one of N jobs, I from 0")
+    parser.add_argument(
+        "--workers", type=int, default=None, help="processes on this machine; by default as many as torch has threads, one per core"
+    )
+    parser.add_argument("--scheduler", type=str, default=None, help="tcp://HOST:PORT of a dask cluster, instead of this machine")
+    return parser
+
+
 def _plot_parser() -> ArgumentParser:
     parser = _Parser(description="Draw one sample of an estimate.")
     parser.add_argument("robot", type=str, help="ROBOT.toml")
@@ -80,6 +94,7 @@ def _plot_parser() -> ArgumentParser:
 COMMANDS = {
     "estimate": (_estimate_parser, "loads from marker positions"),
     "simulate": (_simulate_parser, "marker positions from known loads"),
+    "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
     "plot": (_plot_parser, "a figure of an estimate"),
 }
 
@@ -95,7 +110,7 @@ def _parser() -> ArgumentParser:
 def _run(options: Namespace) -> None:
     from . import commands
 
-    getattr(commands, options.subcommand)(options[options.subcommand])
+    getattr(commands, options.subcommand.replace("-", "_"))(options[options.subcommand])
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,6 +1,7 @@
 """What each command does, once its arguments are known."""
 
 import math
+import re
 import warnings
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +14,22 @@ from .coordinates import GaussianCoordinates
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
-from .io import RESULT_SUFFIXES, Shapes, read_fit, read_robot, read_shapes, write_result, write_shapes
+from .io import (
+    RESULT_SUFFIXES,
+    Shapes,
+    has_shard,
+    prepare_folder,
+    read_dataset_spec,
+    read_fit,
+    read_robot,
+    read_shapes,
+    write_manifest,
+    write_result,
+    write_shapes,
+)
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers, Model
+from .production import produce
 from .result import Estimate
 from .robot import Robot
 from .rod import DTYPE
@@ -186,6 +200,37 @@ def _known_loads(options: Namespace, L: float) -> tuple[Load, ...]:
             raise InputError("--tip-force and --tip-moment must be finite")
         loads.append(PointWrenches(wrench[:1].unsqueeze(0), wrench[1:].unsqueeze(0), torch.tensor([L], dtype=DTYPE)))
     return tuple(loads)
+
+
+def _every_nth(shard: str | None, count: int) -> range:
+    """The shards of job I of N; all of them without --shard."""
+    if shard is None:
+        return range(count)
+    job = re.fullmatch(r"(\d{1,9})/(\d{1,9})", shard, re.ASCII)
+    if job is None or not int(job[1]) < int(job[2]):
+        raise InputError(f"--shard is {shard!r}; it must be I/N, job I of N, with I from 0 to N - 1")
+    return range(int(job[1]), count, int(job[2]))
+
+
+def simulate_dataset(options: Namespace) -> None:
+    """torchrod simulate-dataset."""
+    spec = read_dataset_spec(options.spec, options.samples, options.seed)
+    mine, folder = _every_nth(options.shard, spec.shards), Path(options.out)
+    if options.workers is not None and options.scheduler is not None:
+        raise InputError("--workers are processes on this machine and --scheduler is a cluster; give one of them")
+    if options.workers is not None and options.workers < 1:
+        raise InputError(f"--workers is {options.workers}; it must be at least 1")
+    prepare_folder(folder, spec)
+    missing = [index for index in mine if not has_shard(folder, spec, index)]
+    kept = sum(spec.samples_in(index) for index in mine) - sum(spec.samples_in(index) for index in missing)
+    total, name = sum(map(spec.samples_in, mine)), f"{len(mine)} shards"
+    with tqdm(
+        total=total, initial=kept, desc=name, unit="sample", unit_scale=True, delay=1.0, leave=False, dynamic_ncols=True
+    ) as bar:
+        produce(spec, folder, missing, options.workers or torch.get_num_threads(), options.scheduler, bar.update)
+    digest = write_manifest(folder, spec)
+    done = f"digest {digest}" if digest else f"the manifest follows when all {spec.shards} shards are there"
+    print(f"{folder}: shards made {len(missing)}, kept {len(mine) - len(missing)}; {done}")  # noqa: T201
 
 
 def plot(options: Namespace) -> None:
