@@ -1,16 +1,16 @@
-"""Studies of the paper beside ours: python scripts/reproduce.py [study1] [coverage] [--quick] [--json FILE] [--out FOLDER].
+"""The paper's studies, figures and tables beside ours: python scripts/reproduce.py [PART ...] [--quick] [--json FILE] [--out DIR].
 
 Each part is a module in scripts/reproduction with run(quick, folder) -> (figures as data, lines of Markdown). The parts that ran
-are written to FOLDER/reproduction.md (docs/ by default) with their pictures, and to FILE as JSON.
+are written to DIR/reproduction.md (docs/ by default) with their pictures, and to FILE as JSON.
 """
 
 import argparse
 import json
 from pathlib import Path
 
-from reproduction import coverage, study1
+from reproduction import coverage, study1, study2, tables
 
-PARTS = {"study1": study1, "coverage": coverage}
+PARTS = {"study1": study1, "study2": study2, "coverage": coverage, "tables": tables}
 HEAD = """# Reproduction
 
 Made by `python scripts/reproduce.py`. The paper's studies beside ours; every row is computed when the command runs.

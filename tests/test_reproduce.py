@@ -23,8 +23,8 @@ def test_quick_reproduction(tmp_path):
     data = json.loads((tmp_path / "f.json").read_text())
     for noise, rows in data["study1"].items():
         for prior in ("point", "contact", "none"):
-            assert rows[prior]["converged"] == 1.0, (noise, prior)
-    clean, noisy = data["study1"]["clean"]["point"], data["study1"]["noise_1mm"]["point"]
+            assert rows["rows"][prior]["converged"] == 1.0, (noise, prior)
+    clean, noisy = data["study1"]["clean"], data["study1"]["noise_1mm"]
     assert clean["location_m_mean"] < 1e-4
     assert clean["force_N_mean"] < 1e-3
     assert noisy["iterations_mean"] < 10

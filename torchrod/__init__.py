@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .actuation import Actuated, reference_lengths, solve_displacement
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .dataset import DatasetSpec, simulate_shard
     from .errors import InputError
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
     from .measurement import Markers, Model
-    from .plot import draw
+    from .plot import draw, draw_on
     from .result import Estimate, Fit
     from .robot import Robot
     from .rod import Rod
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from .tendons import Tendon, Tendons
 
 _HOMES = {
+    "actuation": ("Actuated", "reference_lengths", "solve_displacement"),
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "dataset": ("DatasetSpec", "simulate_shard"),
     "errors": ("InputError",),
@@ -36,6 +38,8 @@ _HOMES = {
         "read_dataset",
         "read_dataset_spec",
         "read_robot",
+        "reference_lengths",
+        "solve_displacement",
         "read_shapes",
         "write_result",
         "write_shapes",
@@ -43,7 +47,7 @@ _HOMES = {
     "jacobian": ("forward_jacobian",),
     "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),
     "measurement": ("Markers", "Model"),
-    "plot": ("draw",),
+    "plot": ("draw", "draw_on"),
     "result": ("Estimate", "Fit"),
     "robot": ("Robot",),
     "rod": ("Rod",),
@@ -52,6 +56,7 @@ _HOMES = {
     "tendons": ("Tendon", "Tendons"),
 }
 __all__ = [
+    "Actuated",
     "Dataset",
     "DatasetSpec",
     "Equilibrium",
@@ -79,6 +84,7 @@ __all__ = [
     "Tendons",
     "cold_start",
     "draw",
+    "draw_on",
     "estimate",
     "forward_jacobian",
     "paper_settings",
@@ -86,8 +92,10 @@ __all__ = [
     "read_dataset_spec",
     "read_robot",
     "read_shapes",
+    "reference_lengths",
     "shape_from_base",
     "simulate_shard",
+    "solve_displacement",
     "solve_shape",
     "write_result",
     "write_shapes",

@@ -21,7 +21,7 @@ from .robot import Robot
 from .rod import DTYPE
 from .statics import shape_from_base
 
-INK, LOAD, MARKER, TENDON = "#1b2a41", "#c8102e", "#0a7f8c", "#9a9a9a"
+INK, LOAD, MARKER, TENDON, TRUTH = "#1b2a41", "#c8102e", "#0a7f8c", "#9a9a9a", "#b5b5b5"
 ARROW = 0.28  # the largest net force is drawn this long, in rod lengths
 ENVELOPE = 0.12  # and the densest load this high
 
@@ -93,45 +93,63 @@ def _look_across(axes: Axes3D, vectors: Float[Tensor, "n 3"]) -> None:
     axes.view_init(elev=18, azim=float(azimuth[best].rad2deg()))
 
 
-def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int, title: str) -> None:
-    """Write the figure of one sample: markers (teal), fitted rod (dark), loads (red); equal axes in metres."""
-    scene = _scene(robot, fit, None if markers.tension is None else markers.tension[sample])
-    seen = markers.positions[sample][markers.present[sample]]
-    figure = Figure(figsize=(8, 7), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(projection="3d")
-    assert isinstance(axes, Axes3D)
-    for i, line in enumerate(scene.tendons):
-        axes.plot(*line.T.numpy(), color=TENDON, linewidth=1.2, label=None if i else "tendons")
-    axes.plot(*scene.line.T.numpy(), color=INK, linewidth=2.5, label="fitted rod")
-    axes.scatter(*seen.T.numpy(), color=MARKER, s=28, depthshade=False, label="markers")  # pyright: ignore[reportArgumentType]
-    if scene.loaded.any():
-        axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, label="load per length")
-        for i in scene.loaded.nonzero().flatten().tolist():
-            axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5)
-    labels: list[tuple[tuple[float, float, float], str]] = []
+def _arrows(axes: Axes3D, scene: _Scene, colour: str, width: float, label: str, order: int) -> None:
     for k, (head, tail) in enumerate(zip(scene.points, scene.tails, strict=True)):
-        axes.quiver(
-            *tail.tolist(),
-            *(head - tail).tolist(),
-            color=LOAD,
-            linewidth=2.2,
-            arrow_length_ratio=0.18,
-            label="net force" if k == 0 else None,
-        )
-        text = f"{float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
-        labels.append((tuple(tail.tolist()), text))
-    axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, label="clamp")
-    everything = torch.cat([scene.line, seen, scene.tails, scene.envelope])
+        (x, y, z), way = tail.tolist(), (head - tail).tolist()
+        name = label if k == 0 else None
+        axes.quiver(x, y, z, *way, color=colour, linewidth=width, arrow_length_ratio=0.18, label=name, zorder=order)
+
+
+def _label(fit: Fit, k: int) -> str:
+    return f"{float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
+
+
+def draw_on(axes: Axes3D, robot: Robot, fit: Fit, markers: Markers, sample: int, truth: Fit | None = None) -> None:
+    """Draw one sample: markers (teal), fitted rod (dark), loads (red), equal axes in metres.
+
+    truth: the true loads where they are known (grey, and in the title).
+    """
+    axes.computed_zorder = False  # by depth, the arrow of a good estimate would vanish behind the true one
+    tension = None if markers.tension is None else markers.tension[sample]
+    scene = _scene(robot, fit, tension)
+    seen = markers.positions[sample][markers.present[sample]]
+    for i, line in enumerate(scene.tendons):
+        axes.plot(*line.T.numpy(), color=TENDON, linewidth=1.2, zorder=1, label=None if i else "tendons")
+    axes.plot(*scene.line.T.numpy(), color=INK, linewidth=2.5, zorder=4, label="fitted rod")
+    look = {"color": MARKER, "s": 28, "depthshade": False, "zorder": 6}
+    axes.scatter(*seen.T.numpy(), label="markers", **look)  # pyright: ignore[reportArgumentType]
+    if scene.loaded.any():
+        axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, zorder=3, label="load per length")
+        for i in scene.loaded.nonzero().flatten().tolist():
+            axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5, zorder=3)
+    vectors, everything = scene.points - scene.tails, torch.cat([scene.line, seen, scene.tails, scene.envelope])
+    if truth is not None:
+        true_scene = _scene(robot, truth, tension)
+        _arrows(axes, true_scene, TRUTH, 6.0, "true force", 2)
+        everything = torch.cat([everything, true_scene.tails])
+        both = [(_label(truth, k), _label(fit, k)) for k in range(min(len(truth.force), len(fit.force)))]
+        axes.set_title("\n".join(f"true {a}, estimated {b}" for a, b in both), fontsize=12)
+    else:
+        for k, (x, y, z) in enumerate(scene.tails.tolist()):
+            axes.text(x, y, z, _label(fit, k), color=LOAD, fontsize=11, fontweight="bold", ha="center", va="bottom")
+    _arrows(axes, scene, LOAD, 2.2, "net force", 5)
+    axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, zorder=6, label="clamp")
     _equal_axes(axes, everything)
     chord = scene.line[-1] - scene.line[0]
     off_chord = scene.line - scene.line[0]
     off_chord = off_chord - (off_chord @ chord / (chord @ chord)).unsqueeze(-1) * chord
     bulge = off_chord[off_chord.norm(dim=-1).argmax()]
     bent = [bulge] if bulge.norm() > 0.02 * chord.norm() else []
-    _look_across(axes, torch.cat([torch.stack([chord, *bent]), scene.points - scene.tails]))
+    _look_across(axes, torch.cat([torch.stack([chord, *bent]), vectors]))
+
+
+def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int, title: str) -> None:
+    """Write the figure of one sample, by `draw_on`."""
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(projection="3d")
+    assert isinstance(axes, Axes3D)
+    draw_on(axes, robot, fit, markers, sample)
     axes.set_title(textwrap.fill(title, 80), fontsize=12)
-    for (x, y, z), text in labels:
-        axes.text(x, y, z, text, color=LOAD, fontsize=11, fontweight="bold", ha="center", va="bottom")
     figure.legend(loc="outside lower center", ncols=6, frameon=False)
     figure.savefig(path, dpi=150)

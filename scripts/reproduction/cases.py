@@ -27,6 +27,11 @@ class Study:
     positions: Tensor
     base_wrench: Tensor
 
+    def repeated(self, times: int) -> "Study":
+        """The same cases over and over, for several draws of noise."""
+        parts = (self.force, self.location, self.positions, self.base_wrench)
+        return Study(self.robot, *(x.repeat(times, *[1] * (x.ndim - 1)) for x in parts))
+
     def noisy(self, noise: float, seed: int) -> Markers:
         """Markers with Gaussian noise (m) on every coordinate."""
         generator = torch.Generator().manual_seed(seed)
@@ -37,24 +42,30 @@ class Study:
         return estimate(Model(self.robot, GaussianCoordinates(1, L, self.robot.rod.force_scale, prior)), markers, sigma)
 
     def bound(self, noise: float, width_known: bool) -> tuple[Tensor, Tensor]:
-        """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N), alpha unknown, for a load 1 mm wide.
+        """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N)."""
+        return load_bound(self.robot, Markers(S, self.positions), self.force, self.location, self.base_wrench, noise, width_known)
 
-        (H^T W H)^-1 at the truth, without any prior; with the width unknown its column stays in.
-        """
-        robot = self.robot
-        model = Model(robot, GaussianCoordinates(1, L, robot.rod.force_scale, "none"))
-        t = self.location / L
-        log_c = torch.full_like(t, math.log(0.5 * (L / 1e-3) ** 2))
-        gamma = torch.cat([self.force / robot.rod.force_scale, torch.logit(t).unsqueeze(-1), log_c.unsqueeze(-1)], -1)
-        markers = Markers(S, self.positions)
-        _, H = model.linearized(model.join(gamma, self.base_wrench), markers)
-        if width_known:
-            H = torch.cat([H[..., :3], H[..., 4:]], -1)
-        w = model.weights(markers, noise)
-        C = torch.linalg.inv(H.mT @ (w.unsqueeze(-1) * H))
-        along = self.force / self.force.norm(dim=-1, keepdim=True)
-        magnitude = (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten().sqrt() * robot.rod.force_scale
-        return C[:, 2, 2].sqrt() * L * t * (1 - t), magnitude
+
+def load_bound(
+    robot: Robot, markers: Markers, force: Tensor, location: Tensor, base_wrench: Tensor, noise: float, width_known: bool
+) -> tuple[Tensor, Tensor]:
+    """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N), alpha unknown, for a load 1 mm wide.
+
+    (H^T W H)^-1 at the truth, without any prior; with the width unknown its column stays in.
+    """
+    L, scale = robot.rod.length, robot.rod.force_scale
+    model = Model(robot, GaussianCoordinates(1, L, scale, "none"))
+    t = location / L
+    log_c = torch.full_like(t, math.log(0.5 * (L / 1e-3) ** 2))
+    gamma = torch.cat([force / scale, torch.logit(t).unsqueeze(-1), log_c.unsqueeze(-1)], -1)
+    _, H = model.linearized(model.join(gamma, base_wrench), markers)
+    if width_known:
+        H = torch.cat([H[..., :3], H[..., 4:]], -1)
+    w = model.weights(markers, noise)
+    C = torch.linalg.inv(H.mT @ (w.unsqueeze(-1) * H))
+    along = force / force.norm(dim=-1, keepdim=True)
+    magnitude = (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten().sqrt() * scale
+    return C[:, 2, 2].sqrt() * L * t * (1 - t), magnitude
 
 
 def study1(count: int, seed: int = 0) -> Study:
