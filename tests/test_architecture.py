@@ -20,7 +20,7 @@ LAYERS = [
     {"io", "plot", "selection"},
     {"estimator"},
     {"result"},
-    {"ekf", "measurement", "dataset"},
+    {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},
     {"march"},
     {"fast"},

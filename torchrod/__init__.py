@@ -38,8 +38,6 @@ _HOMES = {
         "read_dataset",
         "read_dataset_spec",
         "read_robot",
-        "reference_lengths",
-        "solve_displacement",
         "read_shapes",
         "write_result",
         "write_shapes",
