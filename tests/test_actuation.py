@@ -1,4 +1,4 @@
-"""Actuation by displacement: paths have the length they were left, slack tendons carry nothing, and tension gives the shape back."""
+"""Actuation by displacement: paths are as long as they were left, slack tendons carry nothing, tensions give the shape back."""
 
 import math
 

@@ -1,6 +1,7 @@
 """Study 1: one point load, with and without noise: convergence, iterations, errors, efficiency, and errors along the rod."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +36,15 @@ def _rms(x: Tensor) -> float:
     return float(x.square().mean().sqrt())
 
 
-def _paper_mode(study: Study, noise: float, sigma: float) -> tuple[Estimate, float]:
+def _paper_mode(study: Study, noise: float, sigma: float, iterations: int) -> tuple[Estimate, float]:
     model = Model(study.robot, PaperCoordinates(1, L), scaled=False)
     start = time.perf_counter()
-    fit = estimate(model, study.noisy(noise, 1), max(sigma, NOISE), paper_settings(model))
+    settings = replace(paper_settings(model), max_iterations=iterations)
+    fit = estimate(model, study.noisy(noise, 1), max(sigma, NOISE), settings)
     return fit, time.perf_counter() - start
 
 
-def run(quick: bool, folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]]:
+def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
     """Every row of the study, its table and its figure. The data hold the point-like prior's row, and all in `rows`."""
     study = study1(20 if quick else 100)
     study.estimate(study.noisy(0.0, 1), 1e-4, "point")  # the first call pays for compiling and caches
@@ -52,7 +54,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]
         for prior in tqdm([*PRIORS, "paper mode"], desc=name, delay=1.0, leave=False):
             start = time.perf_counter()
             if prior == "paper mode":
-                fit, seconds = _paper_mode(study, noise, sigma)
+                fit, seconds = _paper_mode(study, noise, sigma, 100 if quick else 500)
             else:
                 fit = study.estimate(study.noisy(noise, 1), sigma, prior)
                 seconds = time.perf_counter() - start
@@ -63,7 +65,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]
     many = study.repeated(2 if quick else 10)
     for prior in tqdm(PRIORS, desc="efficiency", delay=1.0, leave=False):
         rows["noise_1mm"][prior] |= efficiency(many, prior)
-    _figure(study, noisy, known, folder / "study1.png")
+    _figure(study, noisy, known, unknown, folder / "study1.png")
     lines = _table(rows, len(study.location))
     lines += ["", "Cramer-Rao bound at 1 mm noise (RMS over the cases): width known "]
     lines[-1] += f"{_rms(known[0]) * 1e3:.2f} mm, {_rms(known[1]):.4f} N; "
@@ -76,7 +78,10 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, dict[str, Any]], list[str]
     lines += ["", "| prior | location | force | location, RMS over RMS | force, RMS over RMS |", "|---|---|---|---|---|"]
     lines += [_efficiency_line(prior, rows["noise_1mm"][prior]) for prior in PRIORS]
     lines += ["", "![Errors along the rod](study1.png)", ""]
-    data = {noise: {**rows[noise]["point"], "prior": "point", "rows": rows[noise]} for noise in ROWS}
+    data: dict[str, Any] = {noise: {**rows[noise]["point"], "prior": "point", "rows": rows[noise]} for noise in ROWS}
+    data["cases"] = {"location_m": study.location.tolist(), "force_N": study.force.norm(dim=-1).tolist()}
+    for name, (location, force) in (("width_known", known), ("width_unknown", unknown)):
+        data["cases"] |= {f"bound_location_m_{name}": location.tolist(), f"bound_force_N_{name}": force.tolist()}
     return data, lines
 
 
@@ -113,19 +118,27 @@ def _efficiency_line(prior: str, row: dict[str, float]) -> str:
     return f"| {prior} | " + " | ".join(f"{row[k]:.2f}" for k in keys) + " |"
 
 
-def _figure(study: Study, noisy: dict[str, Estimate], bound: tuple[Tensor, Tensor], path: Path) -> None:
-    """Errors against the true location, with the bound, 1 mm noise."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
+def _figure(
+    study: Study,
+    noisy: dict[str, Estimate],
+    known: tuple[Tensor, Tensor],
+    unknown: tuple[Tensor, Tensor],
+    path: Path,
+) -> None:
+    """Errors against the true location, with the bounds, 1 mm noise."""
+    figure = Figure(figsize=(10, 4.2), layout="constrained")
     order = torch.argsort(study.location)
-    for k, (label, unit, scale) in enumerate((("location error", "mm", 1e3), ("force error", "N", 1.0))):
+    at = 1e3 * study.location
+    for k, (label, unit, scale, least) in enumerate((("location error", "mm", 1e3, 0.05), ("force error", "N", 1.0, 3e-4))):
         axes = figure.add_subplot(1, 2, k + 1)
         for prior, colour in (("contact", "#0a7f8c"), ("point", "#c8102e")):
             fit = noisy[prior]
             error = fit.location[:, 0] - study.location if k == 0 else fit.magnitude[:, 0] - study.force.norm(dim=-1)
-            axes.semilogy(study.location * 1e3, error.abs() * scale, "o", ms=3.5, color=colour, label=f"{prior} prior")
-        axes.semilogy(
-            study.location[order] * 1e3, bound[k][order] * scale, color="#1b2a41", lw=1, label="Cramer-Rao bound (1 sigma)"
-        )
+            # An error that happens to be tiny says nothing: it is drawn at the lower edge.
+            axes.semilogy(at, (error.abs() * scale).clamp(min=least), "o", ms=3.5, color=colour, label=f"{prior} prior")
+        for bound, style, name in ((known, "-", "width known"), (unknown, "--", "width unknown")):
+            axes.semilogy(at[order], bound[k][order] * scale, style, color="#1b2a41", lw=1, label=f"bound, {name}")
+        axes.set_ylim(bottom=least)
         axes.set_xlabel("true location (mm)")
         axes.set_ylabel(f"{label} ({unit}), 1 mm noise")
         axes.grid(alpha=0.3)
