@@ -1,4 +1,4 @@
-"""Studies of the paper beside ours: python scripts/reproduce.py [study1] [coverage] [--quick] [--json FILE] [--out FOLDER].
+"""Studies of the paper beside ours: python scripts/reproduce.py [PART ...] [--quick] [--json FILE] [--out FOLDER].
 
 Each part is a module in scripts/reproduction with run(quick, folder) -> (figures as data, lines of Markdown). The parts that ran
 are written to FOLDER/reproduction.md (docs/ by default) with their pictures, and to FILE as JSON.
@@ -8,9 +8,15 @@ import argparse
 import json
 from pathlib import Path
 
-from reproduction import coverage, study1
+from reproduction import coverage, errata, sensitivity, sinusoids, study1
 
-PARTS = {"study1": study1, "coverage": coverage}
+PARTS = {
+    "sinusoids": sinusoids,
+    "sensitivity": sensitivity,
+    "study1": study1,
+    "coverage": coverage,
+    "errata": errata,
+}
 HEAD = """# Reproduction
 
 Made by `python scripts/reproduce.py`. The paper's studies beside ours; every row is computed when the command runs.
