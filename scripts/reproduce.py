@@ -8,9 +8,17 @@ import argparse
 import json
 from pathlib import Path
 
-from reproduction import coverage, study1, study2, tables
+from reproduction import coverage, errata, sensitivity, sinusoids, study1, study2, tables
 
-PARTS = {"study1": study1, "study2": study2, "coverage": coverage, "tables": tables}
+PARTS = {
+    "sinusoids": sinusoids,
+    "sensitivity": sensitivity,
+    "study1": study1,
+    "study2": study2,
+    "coverage": coverage,
+    "tables": tables,
+    "errata": errata,
+}
 HEAD = """# Reproduction
 
 Made by `python scripts/reproduce.py`. The paper's studies beside ours; every row is computed when the command runs.
