@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .calibration import Calibration, calibrate
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .dataset import DatasetSpec, simulate_shard
     from .errors import InputError
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from .tendons import Tendon, Tendons
 
 _HOMES = {
+    "calibration": ("Calibration", "calibrate"),
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "dataset": ("DatasetSpec", "simulate_shard"),
     "errors": ("InputError",),
@@ -52,6 +54,7 @@ _HOMES = {
     "tendons": ("Tendon", "Tendons"),
 }
 __all__ = [
+    "Calibration",
     "Dataset",
     "DatasetSpec",
     "Equilibrium",
@@ -77,6 +80,7 @@ __all__ = [
     "Status",
     "Tendon",
     "Tendons",
+    "calibrate",
     "cold_start",
     "draw",
     "estimate",
