@@ -23,7 +23,7 @@ from .robot import Robot
 from .rod import DTYPE
 from .status import Status
 from .tendons import Tendons
-from .unloaded import MASS, OFFSET, PRIOR, STIFFNESS, UnloadedShapes
+from .unloaded import MASS, OFFSET, PRIOR, STIFFNESS, Trial, UnloadedShapes
 
 RETREATS = 5  # halvings of a step that loses samples, before they are given up
 HARDLY = 0.5  # a standard deviation of theta above this determines nothing
@@ -124,8 +124,7 @@ def calibrate(
     check(Model(robot, GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale)), markers, noise)
     shapes = UnloadedShapes(robot, markers, markers.present / noise**2, youngs_modulus, tension_offset, steps)
     _refuse(shapes)
-    theta, iterations, status = _iterate(shapes, settings or Settings())
-    return _result(shapes, theta, iterations, status)
+    return _result(shapes, *_iterate(shapes, settings or Settings()))
 
 
 def _refuse(shapes: UnloadedShapes) -> None:
@@ -145,26 +144,27 @@ def _refuse(shapes: UnloadedShapes) -> None:
         raise ValueError(f"{seen} marker coordinates cannot determine {unknowns} parameters; add markers or shapes")
 
 
-def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, " n"], int, Status]:
+def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, " n"], Trial, int, Status]:
     """The filter on theta: the recursion of torchrod.estimator for one state."""
     mean = theta = before = shapes.start()
     Q, Sigma0 = settings.Q * torch.ones_like(theta), torch.diag(settings.Sigma0 * torch.ones_like(theta))[None]
     Sigma, kept, retreats, cap = Sigma0, torch.zeros(len(shapes.weights), dtype=torch.bool), 0, torch.full((1,), torch.inf)
     for iteration in range(1, settings.max_iterations + 1):
-        at, w, solved = shapes.linearize(theta, mean)
+        trial = shapes.linearize(theta, mean)
+        at, w, solved = trial.at, trial.w, trial.solved
         if bool((kept & ~solved).any()) and retreats < RETREATS:
             # A step too far: half way back to the last place where these samples had an equilibrium.
             theta, retreats = 0.5 * (theta + before), retreats + 1
             continue
         if not bool((w > 0).any()):
             if iteration > 1:
-                return theta, iteration, Status.NOT_CONVERGED
+                return theta, trial, iteration, Status.NOT_CONVERGED
             raise ValueError(
                 f"no sample has markers, finite tensions and an equilibrium at {float(theta[0].exp()):.3g} kg/m; check the units "
                 "of tensions and stiffness, or start from another mass_per_length"
             )
         if bool(at.decrement < (DECREMENT_SHARE * at.cost).clamp(min=DECREMENT)):
-            return theta, iteration, Status.CONVERGED
+            return theta, trial, iteration, Status.CONVERGED
         inflated = torch.minimum(ekf.inflation(w, w.shape[-1], at.decrement), cap)
         weights = ekf.adapted_weights(w, w.shape[-1], inflated) if settings.adaptive else w
         A, g = ekf.information(at.H, at.r, weights, theta[None], mean, torch.full_like(theta, PRIOR))
@@ -174,23 +174,25 @@ def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, 
         Sigma = Sigma_next if bool(torch.isfinite(Sigma_next).all()) else Sigma0
         before, kept, retreats = theta, solved, 0
         theta = shapes.stopped_at_kinks(theta, ekf.limited(step, settings.step_limit)[0])
-    return theta, settings.max_iterations, Status.NOT_CONVERGED
+    return theta, shapes.linearize(theta, mean), settings.max_iterations, Status.NOT_CONVERGED
 
 
-def _result(shapes: UnloadedShapes, theta: Float[Tensor, " n"], iterations: int, status: Status) -> Calibration:
+def _result(shapes: UnloadedShapes, theta: Float[Tensor, " n"], trial: Trial, iterations: int, status: Status) -> Calibration:
     """Values and standard deviations in SI units, residuals and chi2 at theta."""
-    at, w, solved = shapes.linearize(theta, shapes.start(), one_sided=False)
-    chi2, dof = float((w * at.r * at.r).sum()), int((w > 0).sum()) - len(theta)
+    r, w = trial.at.r, trial.w
+    chi2, dof = float((w * r * r).sum()), int((w > 0).sum()) - len(theta)
     excess = max(1.0, chi2 / max(dof, 1))
     prior = torch.diag(torch.full_like(theta, PRIOR))
     values, log, names = shapes.physical(theta), shapes.logarithmic, shapes.names
     unknown = math.nan if status is not Status.CONVERGED else 1.0
-    stated, std = (unknown * ekf.posterior((at.A - prior) / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess))
+    stated, std = (
+        unknown * ekf.posterior((trial.A_mean - prior) / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess)
+    )
     size = torch.where(log, values, shapes.unit)
     reach = Z95 * torch.stack([-std, std], -1)
     around = values.unsqueeze(-1)
     interval = torch.where(log.unsqueeze(-1), around * reach.exp(), around + reach * size.unsqueeze(-1))
-    residual = torch.where(w > 0, at.r, torch.nan).reshape(shapes.markers.positions.shape)
+    residual = torch.where(w > 0, r, torch.nan).reshape(shapes.markers.positions.shape)
     return Calibration(
         names,
         shapes.before(),
@@ -199,7 +201,7 @@ def _result(shapes: UnloadedShapes, theta: Float[Tensor, " n"], iterations: int,
         stated * size,
         interval,
         tuple(name for name, s in zip(names, std.tolist(), strict=True) if s > HARDLY),
-        solved & shapes.markers.present.any(-1),
+        trial.solved & shapes.markers.present.any(-1),
         residual,
         chi2,
         dof,

@@ -42,6 +42,19 @@ MASS, STIFFNESS, OFFSET = "mass_per_length", "stiffness_factor", "tension_offset
 
 
 @dataclass(frozen=True)
+class Trial:
+    """The model at one theta: linearized as a batch of 1, with weights w, and the samples that have an equilibrium.
+
+    A_mean: H^T W H + P with the mean slope at a kink (3), the sensitivity that the covariance is made of.
+    """
+
+    at: Linearized
+    A_mean: Float[Tensor, "1 n n"]
+    w: Float[Tensor, "1 z"]
+    solved: Bool[Tensor, " B"]
+
+
+@dataclass(frozen=True)
 class UnloadedShapes:
     """theta, and what the markers of all samples show of it. weights (B, P) 1/m^2, zero where a marker is missing."""
 
@@ -128,13 +141,8 @@ class UnloadedShapes:
         room = torch.where(crossed, before.abs(), torch.inf).amin(0)
         return theta + torch.minimum(step.abs(), room) * step.sign()
 
-    def linearize(
-        self, theta: Float[Tensor, " n"], mean: Float[Tensor, " n"], one_sided: bool = True
-    ) -> tuple[Linearized, Float[Tensor, "1 z"], Bool[Tensor, " B"]]:
-        """The model at theta as one stacked measurement (a batch of 1), its weights, and the samples that have an equilibrium.
-
-        one_sided=False takes the mean slope at a kink: the sensitivity that the covariance is made of.
-        """
+    def linearize(self, theta: Float[Tensor, " n"], mean: Float[Tensor, " n"]) -> "Trial":
+        """The model at theta as one stacked measurement."""
         n = len(theta)
         shift = STEP * torch.eye(n, dtype=DTYPE)
         p = self.seen(torch.cat([theta[None], theta + shift, theta - shift]))
@@ -145,11 +153,13 @@ class UnloadedShapes:
         ahead, back, H = (torch.where(w > 0, d, 0.0).mT / STEP for d in (up - h, h - down, 0.5 * (up - down)))
         precision = torch.full_like(theta, PRIOR)
         kinks = (self._distance(theta).abs() <= STEP).any(0)
-        if one_sided and bool(kinks.any()):
+        A_mean, g = ekf.information(H[None], r, w, theta[None], mean, precision)
+        A = A_mean
+        if bool(kinks.any()):
             H = _towards_descent(H, ahead, back, kinks, lambda H: ekf.information(H[None], r, w, theta[None], mean, precision))
-        A, g = ekf.information(H[None], r, w, theta[None], mean, precision)
+            A, g = ekf.information(H[None], r, w, theta[None], mean, precision)
         cost = (w * r * r).sum(-1) + (precision * (mean - theta) ** 2).sum(-1)
-        return Linearized(r, H[None], A, g, cost, ekf.decrement(A, g)), w, solved
+        return Trial(Linearized(r, H[None], A, g, cost, ekf.decrement(A, g)), A_mean, w, solved)
 
 
 def _towards_descent(

@@ -31,7 +31,7 @@ def _sections(lines: list[str], name: str) -> list[range]:
     """Line numbers of the bodies of every table of this name."""
     headers = [(i, match[1]) for i, line in enumerate(lines) if (match := HEADER.match(line.rstrip("\r\n")))]
     ends = [i for i, _ in headers[1:]] + [len(lines)]
-    return [range(i + 1, end) for (i, found), end in zip(headers, ends, strict=True) if found == name]
+    return [range(i + 1, end) for (i, found), end in zip(headers, ends, strict=False) if found == name]
 
 
 def _key_lines(lines: list[str], section: range, key: str) -> range:
