@@ -30,6 +30,7 @@ from torchrod import (
 from torchrod.cli import main
 from torchrod.lie import rotate
 from torchrod.status import Status
+from torchrod.unloaded import UnloadedShapes
 
 T = torch.tensor
 NOISE = 2.5e-4
@@ -117,7 +118,7 @@ def test_offsets_at_the_kink_of_a_slack_tendon():
     """Readings of zero and offsets near zero: the cost has a kink where the search starts, and often its minimum there."""
     make, mass, tension = ROBOTS["two tendons"]
     p = shapes_of(make(), tension, noise=0.0)
-    for seed in range(6):
+    for seed in range(4):
         noise = NOISE * torch.randn(p.positions.shape, generator=torch.Generator().manual_seed(seed))
         found = run(make(0.8 * mass), replace(p, positions=p.positions + noise), seed % 2 == 0, True)
         assert found.accepted
@@ -125,16 +126,26 @@ def test_offsets_at_the_kink_of_a_slack_tendon():
         assert bool((found.values[-2:].abs() < 3 * found.std[-2:]).all())
 
 
-def test_the_interval_of_log_mass_covers():
+def test_the_interval_of_log_mass_covers(monkeypatch):
     """200 repeats of two shapes with three markers: 90 to 99 % of the 95 % intervals hold the truth."""
-    rod = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.03), gravity=SIDEWAYS)
+    solve, known = UnloadedShapes.seen, {}
+
+    def seen(self, theta):
+        """All repeats start at one theta, and the forward solve does not see the noise: solve for it once."""
+        key = theta.numpy().tobytes()
+        if key not in known:
+            known[key] = solve(self, theta)
+        return known[key]
+
+    monkeypatch.setattr(UnloadedShapes, "seen", seen)
+    rod = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.003), gravity=SIDEWAYS)
     s = torch.linspace(0.15, 0.4, 3)
     p = solve_shape(rod, (), None, s, 2, 4).p
     generator, held, repeats = torch.Generator().manual_seed(5), 0, 200
     for _ in range(repeats):
-        markers = Markers(s, p + 2e-3 * torch.randn(p.shape, generator=generator))
-        low, high = calibrate(rod, markers, 2e-3, steps=4).interval_95[0].tolist()
-        held += low <= 0.03 <= high
+        markers = Markers(s, p + 2e-4 * torch.randn(p.shape, generator=generator))
+        low, high = calibrate(rod, markers, 2e-4, steps=4).interval_95[0].tolist()
+        held += low <= 0.003 <= high
     assert 0.90 <= held / repeats <= 0.99, held
 
 
