@@ -1,7 +1,8 @@
 """The paper's studies, figures and tables beside ours: python scripts/reproduce.py [PART ...] [--quick] [--json FILE] [--out DIR].
 
 Each part is a module in scripts/reproduction with run(quick, folder) -> (figures as data, lines of Markdown). The parts that ran
-are written to DIR/reproduction.md (docs/ by default) with their pictures, and to FILE as JSON.
+are written to DIR/reproduction.md with their pictures, and to FILE as JSON. DIR is docs/ for a run of everything, out/ for a quick
+or partial one, so that it does not take the full page's place.
 """
 
 import argparse
@@ -9,7 +10,9 @@ import json
 from pathlib import Path
 
 from reproduction import coverage, errata, sensitivity, sinusoids, study1, study2, tables
+from reproduction.summary import summary
 
+ROOT = Path(__file__).resolve().parents[1]
 PARTS = {
     "sinusoids": sinusoids,
     "sensitivity": sensitivity,
@@ -31,20 +34,21 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="which parts; all by default")
     parser.add_argument("--quick", action="store_true", help="fewer cases, under a minute")
     parser.add_argument("--json", type=Path, help="write the figures as data")
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs", help="folder of page and pictures"
-    )
+    parser.add_argument("--out", type=Path, help="folder of page and pictures")
     options = parser.parse_args()
+    whole = not options.parts and not options.quick
+    options.out = options.out or ROOT / ("docs" if whole else "out")
     options.out.mkdir(parents=True, exist_ok=True)
-    data, page = {}, [HEAD]
+    data, page, text = {}, [], ""
     for name in options.parts or PARTS:
         print(f"{name} ...", flush=True)
         data[name], lines = PARTS[name].run(options.quick, options.out)
         page += lines
-        (options.out / "reproduction.md").write_text("\n".join(page), encoding="utf-8")
+        text = "\n".join([HEAD, *summary(data), *page])
+        (options.out / "reproduction.md").write_text(text, encoding="utf-8")
         if options.json:
             options.json.write_text(json.dumps(data, indent=1), encoding="utf-8")
-    print("\n".join(page))
+    print(text)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,12 @@ SCRIPTS = sorted((ROOT / "scripts").rglob("*.py")) + sorted((ROOT / "training").
 LAYERS = [
     {"cli"},
     {"commands"},
+    {"calibrate_command"},
+    {"arguments"},
     {"production"},
     {"io", "plot", "selection"},
+    {"calibration"},
+    {"unloaded"},
     {"estimator"},
     {"result"},
     {"ekf", "measurement", "dataset", "actuation"},

@@ -10,6 +10,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .actuation import Actuated, reference_lengths, solve_displacement
+    from .calibration import Calibration, calibrate
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .dataset import DatasetSpec, simulate_shard
     from .errors import InputError
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "actuation": ("Actuated", "reference_lengths", "solve_displacement"),
+    "calibration": ("Calibration", "calibrate"),
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "dataset": ("DatasetSpec", "simulate_shard"),
     "errors": ("InputError",),
@@ -55,6 +57,7 @@ _HOMES = {
 }
 __all__ = [
     "Actuated",
+    "Calibration",
     "Dataset",
     "DatasetSpec",
     "Equilibrium",
@@ -80,6 +83,7 @@ __all__ = [
     "Status",
     "Tendon",
     "Tendons",
+    "calibrate",
     "cold_start",
     "draw",
     "draw_on",

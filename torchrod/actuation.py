@@ -8,7 +8,7 @@ It cannot push, so that with l(tau) the length of its path in equilibrium
 for all tendons together. Solved by a primal-dual active set with Newton steps: taut are those with tau - k (A - l) > 0.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +20,7 @@ from .loads import Load
 from .robot import Robot
 from .statics import Equilibrium, solve_shape
 from .status import Status
+from .tendons import Tendons
 
 CHORDS = 32  # per tendon; the sum of chords is extrapolated from 16 and 32 (Richardson), which leaves about 1e-9 of the length
 LENGTH_TOLERANCE = 1e-9  # of the path, relative to the rod's length
@@ -29,7 +30,10 @@ PROBE = 1e-3  # relative change of tension by which the first Jacobian is differ
 
 @dataclass(frozen=True)
 class Actuated:
-    """equilibrium: the robot's shape. tension (B, T) N; slack (B, T): which tendons carry none; path (B, T) m: their lengths."""
+    """equilibrium: the robot's shape. slack (B, T): which tendons carry nothing; path (B, T) m: their lengths.
+
+    tension (B, T) N: what the tendons carry; a load cell reads `tension_offset` less.
+    """
 
     equilibrium: Equilibrium
     tension: Float[Tensor, "B T"]
@@ -81,6 +85,8 @@ def solve_displacement(
     B, T = displacement.shape
     if len(robot.tendons) != T or not T:
         raise ValueError(f"{T} displacements for {len(robot.tendons)} tendons; give one per tendon")
+    # The load cells' offsets belong to readings; here the unknowns are the tensions themselves.
+    robot = replace(robot, tendons=Tendons(tuple(replace(t, tension_offset=0.0) for t in robot.tendons.tendons)))
     stations = _stations(robot)
     allowed = reference_lengths(robot) - displacement
     places = torch.cat([outputs, stations.flatten()])

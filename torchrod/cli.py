@@ -46,6 +46,19 @@ def _estimate_parser() -> ArgumentParser:
     return parser
 
 
+def _calibrate_parser() -> ArgumentParser:
+    parser = _Parser(description="Mass per length of a robot, from shapes that nothing but gravity and its tendons bends.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml with gravity; its mass_per_length is the start, if positive")
+    parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz without external load, all of this robot")
+    parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
+    parser.add_argument("--youngs-modulus", action="store_true", help="also the stiffness, E and G together; needs tensions")
+    parser.add_argument("--tension-offset", action="store_true", help="also one offset (N) per tendon, added to its readings")
+    parser.add_argument("--out", type=str, default=None, help="CALIBRATED.toml: ROBOT.toml with the new values, comments kept")
+    parser.add_argument("--json", type=str, default=None, help="RESULT.json")
+    parser.add_argument("--max-iterations", type=int, default=100, help="give up after this many")
+    return parser
+
+
 def _simulate_parser() -> ArgumentParser:
     parser = _Parser(description="The shape of a robot under known loads, as marker positions.")
     parser.add_argument("robot", type=str, help="ROBOT.toml")
@@ -93,6 +106,7 @@ def _plot_parser() -> ArgumentParser:
 
 COMMANDS = {
     "estimate": (_estimate_parser, "loads from marker positions"),
+    "calibrate": (_calibrate_parser, "mass per length from unloaded shapes"),
     "simulate": (_simulate_parser, "marker positions from known loads"),
     "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
     "plot": (_plot_parser, "a figure of an estimate"),

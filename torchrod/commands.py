@@ -10,6 +10,8 @@ import torch
 from jsonargparse import Namespace
 from tqdm import tqdm
 
+from .arguments import noise_std, positive, writable
+from .calibrate_command import calibrate
 from .coordinates import GaussianCoordinates
 from .errors import InputError
 from .estimator import Settings
@@ -37,25 +39,10 @@ from .selection import select_count
 from .statics import solve_shape
 from .status import Status
 
+__all__ = ["calibrate", "estimate", "plot", "simulate", "simulate_dataset"]
+
 MAX_CONTACTS = 3
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
-
-
-def _positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise InputError(f"{name} is {value}; it must be a positive number")
-
-
-def _writable(path: str | None, suffixes: tuple[str, ...]) -> None:
-    """Refuse before the work, not after it."""
-    if path is None:
-        return
-    if Path(path).suffix not in suffixes:
-        raise InputError(f"{path}: cannot write this kind of file; let its name end in {' or '.join(suffixes)}")
-    if not Path(path).resolve().parent.is_dir():
-        raise InputError(f"{path}: its folder does not exist; create it first")
-    if Path(path).is_dir():
-        raise InputError(f"{path}: is a folder; give a file name")
 
 
 def _count(options: Namespace, robot: Robot) -> int | None:
@@ -81,14 +68,13 @@ def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot)
-    if not 1e-9 <= options.noise <= 1:
-        raise InputError(f"--noise is {options.noise}; it must be a standard deviation in metres, from 1e-9 to 1")
+    noise_std(options.noise)
     if options.warm_start not in ("auto", "off"):
         raise InputError(f"--warm-start {options.warm_start}: this version reads no checkpoints; use auto or off")
-    _positive("--steps", options.steps)
-    _positive("--max-iterations", options.max_iterations)
-    _writable(options.out, RESULT_SUFFIXES)
-    _writable(options.plot, FIGURE_SUFFIXES)
+    positive("--steps", options.steps)
+    positive("--max-iterations", options.max_iterations)
+    writable(options.out, RESULT_SUFFIXES)
+    writable(options.plot, FIGURE_SUFFIXES)
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
@@ -170,7 +156,7 @@ def simulate(options: Namespace) -> None:
         raise InputError(f"--seed is {options.seed}; it must be from 0 to 2^63 - 1")
     if not (math.isfinite(options.noise) and options.noise >= 0):
         raise InputError(f"--noise is {options.noise}; it must be at least 0")
-    _writable(options.out, (".csv",))
+    writable(options.out, (".csv",))
     s = torch.tensor(at, dtype=DTYPE)
     tensions = torch.tensor([tension], dtype=DTYPE) if T else None
     shape = solve_shape(robot, _known_loads(options, L), tensions, s, 1)
@@ -242,6 +228,6 @@ def plot(options: Namespace) -> None:
     sample = options.sample or shapes.samples[0]
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
-    _writable(options.out, FIGURE_SUFFIXES)
+    writable(options.out, FIGURE_SUFFIXES)
     fit = read_fit(options.result, sample)
     draw(options.out, robot, fit, shapes.markers, shapes.samples.index(sample), f"{robot.name}, sample {sample}")

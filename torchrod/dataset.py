@@ -108,7 +108,11 @@ def _robot_record(robot: Robot) -> dict[str, object]:
         "length": rod.length,
         **{key: getattr(rod, key).tolist() for key in ("K_se", "K_bt", "mass_per_length", "reference_curvature")},
         "gravity": robot.gravity.tolist(),
-        "tendons": [{"routing": t.routing, "ends_at": t.ends_at} for t in robot.tendons.tendons],
+        # A tendon without an offset is recorded as before there were offsets, so that a specification keeps its checksum.
+        "tendons": [
+            {"routing": t.routing, "ends_at": t.ends_at} | ({"tension_offset": t.tension_offset} if t.tension_offset else {})
+            for t in robot.tendons.tendons
+        ],
     }
 
 

@@ -71,6 +71,12 @@ def update(
     return both[..., 0], 0.5 * (Sigma + Sigma.mT)
 
 
+def limited(step: Float[Tensor, "B n"], limit: float) -> Float[Tensor, "B n"]:
+    """The step, shortened so that no entry changes by more than the limit; zero where the update failed."""
+    step = step.nan_to_num(0.0, 0.0, 0.0)
+    return step * (limit / step.abs().amax(-1, keepdim=True).clamp(min=1e-300)).clamp(max=1.0)
+
+
 def posterior(A: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
     """(H^T W H + P)^-1 with the true noise: the covariance of the estimate."""
     return solve_spd(A, torch.eye(A.shape[-1], dtype=A.dtype).expand_as(A))

@@ -99,12 +99,6 @@ def _silent(_: int) -> None:
     """No progress bar."""
 
 
-def _limited(step: Float[Tensor, "B n"], limit: float) -> Float[Tensor, "B n"]:
-    """The step, shortened so that no entry changes by more than the limit; zero where the update failed."""
-    step = step.nan_to_num(0.0, 0.0, 0.0)
-    return step * (limit / step.abs().amax(-1, keepdim=True).clamp(min=1e-300)).clamp(max=1.0)
-
-
 def _filter(
     model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"], progress: Callable[[int], object]
 ) -> Estimate:
@@ -137,7 +131,7 @@ def _filter(
         settled = (g * step).sum(-1) < SETTLED
         cap[live] = torch.where(settled, 0.1 * inflated, cap[live])
         fresh = torch.isfinite(Sigma_next).flatten(1).all(-1) & finite
-        onward = x[live] + _limited(step, settings.step_limit)
+        onward = x[live] + ekf.limited(step, settings.step_limit)
         # A model that overflowed says nothing: go half way back to the last place where it did.
         onward = torch.where(finite.unsqueeze(-1), onward, 0.5 * (x[live] + before[live]))
         before[live] = torch.where(finite.unsqueeze(-1), x[live], before[live])

@@ -29,13 +29,17 @@ LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put o
 
 
 def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid) -> StageTable:
-    """All that is known along the rod, at the stages of every step of the grid. tension: (..., T), N."""
+    """All that is known along the rod, at the stages of every step of the grid. tension: (..., T) readings, N.
+
+    The only place where a reading becomes the tension that pulls.
+    """
     s, inside = grid.stages, grid.inside
     integrals = total(loads, s, inside) + robot.weight_beyond(s)
     tendons = None
     if len(robot.tendons) and tension is not None:
-        newton = robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension)
-        tendons = robot.tendons.table(s, inside, tension[..., None, None, :], newton)
+        tau = robot.tendons.true_tension(tension)
+        newton = robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tau)
+        tendons = robot.tendons.table(s, inside, tau[..., None, None, :], newton)
     return StageTable(integrals, robot.rod.curvature_at(s), tendons)
 
 

@@ -25,15 +25,17 @@ class Tendon:
 
     routing: rows [s, x, y] (m): its offset from the centre line in the section frame; one row is a straight tendon, more rows
     are joined by a C2 cubic spline in s. ends_at: arc length (m) at which it is fixed to the rod.
+    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`).
     """
 
     routing: tuple[tuple[float, float, float], ...]
     ends_at: float
+    tension_offset: float = 0.0
 
     @classmethod
-    def straight(cls, x: float, y: float, ends_at: float) -> "Tendon":
+    def straight(cls, x: float, y: float, ends_at: float, tension_offset: float = 0.0) -> "Tendon":
         """A tendon parallel to the centre line at offset (x, y) (m)."""
-        return cls(((0.0, x, y),), ends_at)
+        return cls(((0.0, x, y),), ends_at, tension_offset)
 
     def offset_at(self, s: Float[Tensor, "..."]) -> tuple[Vector, Vector]:
         """r(s) (m) and r'(s) (-), section frame, third component zero; s may carry derivatives (moving nodes)."""
@@ -76,6 +78,10 @@ class Tendons:
     def ends(self) -> tuple[float, ...]:
         """Arc lengths (m) at which tendons end: step boundaries of the integration."""
         return tuple(t.ends_at for t in self.tendons)
+
+    def true_tension(self, reading: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+        """tau = max(reading + tension_offset, 0) (N): a load cell has a zero offset, and a tendon can only pull."""
+        return (reading + torch.tensor([t.tension_offset for t in self.tendons], dtype=DTYPE)).clamp(min=0.0)
 
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
         """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""

@@ -68,6 +68,11 @@ def load_bound(
     return C[:, 2, 2].sqrt() * L * t * (1 - t), magnitude
 
 
+def mean_error(bounds: list[float]) -> float:
+    """Mean |error| of Gaussian errors with these standard deviations."""
+    return math.sqrt(2 / math.pi) * sum(bounds) / len(bounds)
+
+
 def study1(count: int, seed: int = 0) -> Study:
     """`count` random cases; their shapes with 160 steps and exact point loads, from tip to base."""
     generator = torch.Generator().manual_seed(seed)

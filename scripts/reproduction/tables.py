@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from torchrod import Estimate, Fit, Robot, Status, draw_on
 
+from .cases import mean_error
 from .twins import MARKERS, MISMATCH, NOISE, Twin, one_tendon, twin, two_tendons
 
 ROBOTS: dict[str, Callable[[], Robot]] = {"I": one_tendon, "II": two_tendons, "III": two_tendons}
@@ -75,6 +76,8 @@ def figures_of(case: Twin, fit: Estimate) -> dict[str, float]:
         "accepted": float(fit.accepted.double().mean()),
         "location_m_mean": float(location.nanmean()),
         "force_N_mean": float(force.nanmean()),
+        "bound_location_m_mean": mean_error(bound[0][torch.isfinite(bound[0])].tolist()),
+        "bound_force_N_mean": mean_error(bound[1][torch.isfinite(bound[1])].tolist()),
         "efficiency_location": float((location / bound[0]).square().nanmean().sqrt()),
         "efficiency_force": float((force / bound[1]).square().nanmean().sqrt()),
     }

@@ -1,12 +1,15 @@
-"""Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ) and data sets (TOML, folders of NPZ and JSON)."""
+"""Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ), calibrations (JSON) and data sets (TOML, folders)."""
 
+from .calibration_file import CALIBRATION_SUFFIXES, unit_of, write_calibration
 from .dataset_file import read_dataset_spec
 from .result_file import RESULT_SUFFIXES, read_fit, write_result
 from .robot_file import read_robot
+from .robot_text import write_calibrated
 from .shape_file import Shapes, read_shapes, write_shapes
 from .shard_file import Dataset, has_shard, prepare_folder, read_dataset, write_manifest, write_shard
 
 __all__ = [
+    "CALIBRATION_SUFFIXES",
     "RESULT_SUFFIXES",
     "Dataset",
     "Shapes",
@@ -17,6 +20,9 @@ __all__ = [
     "read_fit",
     "read_robot",
     "read_shapes",
+    "unit_of",
+    "write_calibrated",
+    "write_calibration",
     "write_manifest",
     "write_result",
     "write_shapes",

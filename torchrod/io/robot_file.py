@@ -27,7 +27,7 @@ ROD_KEYS = {
     "K_bt",
 }
 SECTION_KEYS = ("diameter", "youngs_modulus", "shear_modulus")
-TENDON_KEYS = {"offset", "routing", "ends_at"}
+TENDON_KEYS = {"offset", "routing", "ends_at", "tension_offset"}
 
 
 def _table(where: str, value: object, known: set[str]) -> dict[str, Any]:
@@ -122,16 +122,17 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
     ends_at = _number(f"{where}.ends_at", table.get("ends_at", length), positive=True)
     if ends_at > length * (1 + 1e-9):
         raise InputError(f"{where}.ends_at is {ends_at} m, beyond the rod's length of {length} m")
+    correction = _number(f"{where}.tension_offset", table.get("tension_offset", 0.0))
     if "offset" in table:
         x, y = _numbers(f"{where}.offset", table["offset"], 2)
-        tendon = Tendon.straight(x, y, ends_at)
+        tendon = Tendon.straight(x, y, ends_at, correction)
     else:
         rows = _rows(f"{where}.routing", table["routing"], 3)
         if len(rows) > 1 and (rows[0][0] > 0 or rows[-1][0] < ends_at):
             raise InputError(
                 f"{where}.routing runs from {rows[0][0]} to {rows[-1][0]} m; it must cover 0 to the tendon's end, {ends_at} m"
             )
-        tendon = Tendon(tuple((s, x, y) for s, x, y in rows), ends_at)
+        tendon = Tendon(tuple((s, x, y) for s, x, y in rows), ends_at, correction)
     if max(math.hypot(x, y) for _, x, y in tendon.routing) > 0.5 * length:
         warnings.warn(f"{where} runs more than half the rod's length beside it; are its offsets in metres?", stacklevel=2)
     return tendon

@@ -179,7 +179,9 @@ def _robot(record: dict[str, Any]) -> Robot:
         torch.tensor(record[key], dtype=torch.float64) for key in ("K_se", "K_bt", "reference_curvature", "gravity")
     )
     rod = Rod.from_stiffness(record["length"], K_se, K_bt, record["mass_per_length"], curvature)
-    tendons = tuple(Tendon(tuple((s, x, y) for s, x, y in t["routing"]), t["ends_at"]) for t in record["tendons"])
+    tendons = tuple(
+        Tendon(tuple((s, x, y) for s, x, y in t["routing"]), t["ends_at"], t.get("tension_offset", 0.0)) for t in record["tendons"]
+    )
     return Robot(rod, Tendons(tendons), gravity, record["name"])
 
 

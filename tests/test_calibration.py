@@ -1,0 +1,391 @@
+"""Calibration: the truth is found from noisy unloaded shapes, the intervals are honest, and the robot file carries it on."""
+
+import json
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrod import (
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PointForces,
+    Robot,
+    Rod,
+    Settings,
+    Shapes,
+    Tendon,
+    Tendons,
+    calibrate,
+    estimate,
+    read_robot,
+    shape_from_base,
+    solve_shape,
+    write_shapes,
+)
+from torchrod.cli import main
+from torchrod.lie import rotate
+from torchrod.status import Status
+from torchrod.unloaded import UnloadedShapes
+
+T = torch.tensor
+NOISE = 2.5e-4
+STEPS = 12
+SIDEWAYS = T([9.81, 0.0, 0.0], dtype=torch.float64)
+OFFSETS = (0.3, -0.2)
+
+
+def one_tendon(mass: float = 0.144, E: float = 207e9, offsets: tuple[float, ...] = (0.0,)) -> Robot:
+    rod = Rod.circular(0.4, 0.0014, E, E * 79 / 207, mass)
+    return Robot(rod, Tendons((Tendon.straight(0.007, 0.0, 0.4, offsets[0]),)), SIDEWAYS)
+
+
+def two_tendons(mass: float = 0.252, E: float = 207e9, offsets: tuple[float, ...] = (0.0, 0.0)) -> Robot:
+    rod = Rod.circular(0.56, 0.002, E, E * 79 / 207, mass)
+    tendons = (Tendon.straight(0.025, 0.0, 0.56, offsets[0]), Tendon.straight(0.0, 0.025, 0.28, offsets[1]))
+    return Robot(rod, Tendons(tendons), SIDEWAYS)
+
+
+ROBOTS = {
+    "one tendon": (one_tendon, 0.144, [[0.0], [2.0], [4.0], [6.0], [8.0]]),
+    "two tendons": (two_tendons, 0.252, [[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [2.0, 4.0], [5.0, 1.0]]),
+}
+
+
+def shapes_of(robot: Robot, tension: list[list[float]], seed: int = 0, count: int = 8, noise: float = NOISE) -> Markers:
+    L, generator = robot.rod.length, torch.Generator().manual_seed(seed)
+    s, tau = torch.linspace(L / count, L, count), T(tension)
+    p = solve_shape(robot, (), tau, s, len(tau), STEPS).p
+    return Markers(s, p + noise * torch.randn(p.shape, generator=generator), None, tau)
+
+
+def run(robot: Robot, markers: Markers, stiffness: bool = False, offsets: bool = False, **rest):
+    return calibrate(robot, markers, NOISE, stiffness, offsets, steps=STEPS, **rest)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_mass_is_found(name):
+    make, mass, tension = ROBOTS[name]
+    found = run(make(0.7 * mass), shapes_of(make(), tension))
+    assert found.status is Status.CONVERGED
+    assert found.accepted
+    assert found.names == ("mass_per_length",)
+    assert abs(float(found.values[0]) - mass) < min(3 * float(found.std[0]), 0.02 * mass)
+    assert float(found.std[0]) < 0.002 * mass
+    assert found.rms_residual == pytest.approx(NOISE * math.sqrt(3), rel=0.2)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(("stiffness", "offsets"), [(True, False), (False, True), (True, True)])
+def test_stiffness_and_offsets_are_found_where_asked(name, stiffness, offsets):
+    make, mass, tension = ROBOTS[name]
+    truth = make(offsets=OFFSETS) if offsets else make()
+    wrong = make(0.8 * mass, E=180e9 if stiffness else 207e9)
+    found = run(wrong, shapes_of(truth, tension, 3), stiffness, offsets)
+    assert found.accepted
+    expected = [mass, *([207 / 180] if stiffness else []), *(OFFSETS[: len(tension[0])] if offsets else [])]
+    assert bool(((found.values - T(expected)).abs() < 3 * found.std).all()), (found.values, found.std)
+    assert bool(((found.values / T(expected) - 1).abs()[: 1 + stiffness] < 0.02).all())
+    assert not found.undetermined
+    robot = found.applied(wrong)
+    assert torch.allclose(robot.rod.K_bt, truth.rod.K_bt, rtol=0.02)
+    assert torch.allclose(robot.rod.K_se, truth.rod.K_se, rtol=0.02)
+
+
+@pytest.mark.parametrize("factor", [0.05, 20.0])
+@pytest.mark.parametrize("name", ROBOTS)
+def test_far_starts_end_at_the_same_place(name, factor):
+    make, mass, tension = ROBOTS[name]
+    markers = shapes_of(make(), tension)
+    near, far = run(make(), markers), run(make(factor * mass), markers)
+    everything = run(make(factor * mass, E=150e9), markers, True, True) if factor < 1 else far
+    assert everything.accepted
+    assert float((far.values - near.values).abs()) < 0.1 * float(near.std)
+
+
+def test_without_a_mass_to_start_from():
+    make, mass, tension = ROBOTS["two tendons"]
+    found = run(make(0.0), shapes_of(make(), tension))
+    assert float(found.before[0]) == 0
+    assert abs(float(found.values[0]) / mass - 1) < 0.02
+
+
+def test_offsets_at_the_kink_of_a_slack_tendon():
+    """Readings of zero and offsets near zero: the cost has a kink where the search starts, and often its minimum there."""
+    make, mass, tension = ROBOTS["two tendons"]
+    p = shapes_of(make(), tension, noise=0.0)
+    for seed in range(4):
+        noise = NOISE * torch.randn(p.positions.shape, generator=torch.Generator().manual_seed(seed))
+        found = run(make(0.8 * mass), replace(p, positions=p.positions + noise), seed % 2 == 0, True)
+        assert found.accepted
+        assert found.iterations < 15
+        assert bool((found.values[-2:].abs() < 3 * found.std[-2:]).all())
+
+
+def test_the_interval_of_log_mass_covers(monkeypatch):
+    """200 repeats of two shapes with three markers: 90 to 99 % of the 95 % intervals hold the truth."""
+    solve, known = UnloadedShapes.seen, {}
+
+    def seen(self, theta):
+        """All repeats start at one theta, and the forward solve does not see the noise: solve for it once."""
+        key = theta.numpy().tobytes()
+        if key not in known:
+            known[key] = solve(self, theta)
+        return known[key]
+
+    monkeypatch.setattr(UnloadedShapes, "seen", seen)
+    rod = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.003), gravity=SIDEWAYS)
+    s = torch.linspace(0.15, 0.4, 3)
+    p = solve_shape(rod, (), None, s, 2, 4).p
+    generator, held, repeats = torch.Generator().manual_seed(5), 0, 200
+    for _ in range(repeats):
+        markers = Markers(s, p + 2e-4 * torch.randn(p.shape, generator=generator))
+        low, high = calibrate(rod, markers, 2e-4, steps=4).interval_95[0].tolist()
+        held += low <= 0.003 <= high
+    assert 0.90 <= held / repeats <= 0.99, held
+
+
+def test_residuals_larger_than_the_noise_widen_the_standard_deviations():
+    make, _, tension = ROBOTS["one tendon"]
+    markers = shapes_of(make(), tension)
+    honest, small = run(make(), markers), calibrate(make(), markers, NOISE / 5, steps=STEPS)
+    assert small.rescaled
+    assert not small.accepted
+    assert float(small.std_noise[0]) < 0.3 * float(honest.std[0])
+    assert float(small.std[0]) == pytest.approx(float(honest.std_noise[0]) * math.sqrt(honest.chi2 / honest.dof), rel=1e-2)
+    assert "state more noise" in small.message
+
+
+def test_missing_markers_weigh_nothing_and_lost_samples_are_named():
+    make, mass, tension = ROBOTS["one tendon"]
+    tension = [*tension, [1e7]]  # no equilibrium: it would crush the rod
+    markers = shapes_of(make(), tension[:5])
+    p = torch.cat([markers.positions, markers.positions[-1:]])
+    p[0] = torch.nan
+    p[1, 2:4] = torch.nan
+    found = run(make(), Markers(markers.s, p, None, T(tension)))
+    assert found.used.tolist() == [False, True, True, True, True, False]
+    assert found.dof == 3 * (8 * 4 - 2) - 1
+    assert found.accepted
+    assert abs(float(found.values[0]) - mass) < 3 * float(found.std[0])
+    tension[2] = [math.nan]
+    assert run(make(), Markers(markers.s, p, None, T(tension))).used.tolist() == [False, True, False, True, True, False]
+
+
+def test_markers_beside_the_centre_line_and_gravity_of_each_sample():
+    make, mass, tension = ROBOTS["two tendons"]
+    truth = replace(make(), gravity=T([[9.81, 0, 0], [0, 9.81, 0], [0, 0, 9.81], [0, 6.9, -6.9], [-9.81, 0, 0]]))
+    s, tau, offsets = torch.linspace(0.07, 0.56, 8), T(tension), 0.02 * torch.eye(3).repeat(3, 1)[:8]
+    shape = solve_shape(truth, (), tau, s, 5, STEPS)
+    noise = NOISE * torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(1))
+    markers = Markers(s, shape.p + rotate(shape.q, offsets) + noise, offsets, tau)
+    found = run(replace(truth, rod=make(0.1).rod), markers, True)
+    assert found.accepted
+    assert abs(float(found.values[0]) - mass) < 3 * float(found.std[0])
+
+
+def test_a_parameter_that_does_not_show_is_named():
+    make, _, _ = ROBOTS["two tendons"]
+    up = replace(make(), gravity=T([0.0, 0.0, -9.81]))
+    straight = Rod.circular(0.56, 0.02, 207e9, 79e9, 0.252)  # stiff, and gravity along it
+    robot = replace(up, rod=straight, tendons=Tendons(()))
+    s = torch.linspace(0.1, 0.56, 5)
+    found = calibrate(robot, Markers(s, solve_shape(robot, (), None, s, 1, STEPS).p), 1e-3, steps=STEPS)
+    assert found.undetermined == ("mass_per_length",)
+    assert "hardly determine mass_per_length" in found.message
+
+
+def test_too_few_iterations_are_reported():
+    make, mass, tension = ROBOTS["one tendon"]
+    found = run(make(20 * mass), shapes_of(make(), tension), settings=Settings(max_iterations=2))
+    assert found.status is Status.NOT_CONVERGED
+    assert not found.accepted
+    assert bool(found.std.isnan().all())
+    assert "Did not converge in 2 iterations" in found.message
+
+
+@pytest.mark.parametrize("fast", ["1", "0"])
+def test_an_offset_shifts_the_readings(fast, monkeypatch):
+    """tension_offset = d is the same as readings larger by d, and a tendon never pushes: forward solve, march and Jacobian."""
+    monkeypatch.setattr("torchrod.fast.library", (lambda: None) if fast == "0" else __import__("torchrod").fast.library)
+    readings, d = T([[1.0, 2.0], [0.1, 3.0]]), T([0.3, -0.4])
+    offset, plain = two_tendons(offsets=(0.3, -0.4)), two_tendons()
+    s = T([0.56])
+    a, b = solve_shape(offset, (), readings, s, 2, 2), solve_shape(plain, (), readings + d, s, 2, 2)
+    assert float((a.p - b.p).abs().max()) < 1e-12
+    alpha = 0.1 * torch.ones(2, 6)
+    marched = [shape_from_base(r, (), alpha, t, s, 2).p for r, t in ((offset, readings), (plain, readings + d))]
+    assert float((marched[0] - marched[1]).abs().max()) < 1e-12
+    coordinates = GaussianCoordinates(1, 0.56, plain.rod.force_scale)
+    x = 0.1 * torch.ones(2, coordinates.size + 6)
+    seen = [
+        Model(r, coordinates, steps=2).linearized(x, Markers(s, a.p, None, t))
+        for r, t in ((offset, readings), (plain, readings + d))
+    ]
+    assert all(float((u - v).abs().max()) < 1e-12 * float(u.abs().max()) for u, v in zip(*seen, strict=True))
+    slack = solve_shape(two_tendons(offsets=(-5.0, -5.0)), (), readings, s, 2, 2).p
+    assert torch.equal(slack, solve_shape(plain, (), 0 * readings, s, 2, 2).p)
+
+
+TOML = """# our robot
+name = "bench"  # [rod]
+[rod]
+mass_per_length = 0.05   # a guess
+length = 0.56
+{section}
+gravity = [9.81, 0.0, 0.0]
+
+[[tendons]]
+  offset = [0.025, 0.0]  # the long one
+  ends_at = 0.56
+
+# the short one
+[[tendons]]
+offset = [0.0, 0.025]
+tension_offset = 0.0 # was zeroed
+ends_at = 0.28"""
+CIRCLE = "diameter = 0.002\nyoungs_modulus = 180e9  # a guess too\nshear_modulus = 68_695_652_173.9"
+MATRIX = """K_se = [216e3, 216e3, # both 1
+  565e3]
+K_bt = [
+  [0.1413716694, 0, 0], # E I, 2
+  [0, 0.1413716694, 0],
+  [0, 0, 0.1079],
+]"""
+
+
+def files(folder: Path, robot: str, markers: Markers) -> tuple[str, str]:
+    path, shapes = folder / "robot.toml", folder / "shapes.csv"
+    path.write_bytes(robot.encode())
+    write_shapes(shapes, Shapes(markers, [f"shape-{b}" for b in range(len(markers.positions))]))
+    return str(path), str(shapes)
+
+
+@pytest.mark.parametrize("section", [CIRCLE, MATRIX], ids=["circle", "matrix"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"], ids=["lf", "crlf"])
+def test_the_text_of_the_robot_file_is_kept(tmp_path, capsys, section, end):
+    text = TOML.format(section=section).replace("\n", end)
+    truth = two_tendons(offsets=OFFSETS)
+    robot, shapes = files(tmp_path, text, shapes_of(truth, ROBOTS["two tendons"][2], 3))
+    out, record = tmp_path / "out.toml", tmp_path / "out.json"
+    options = ["--noise", "2.5e-4", "--youngs-modulus", "--tension-offset", "--out", str(out), "--json", str(record)]
+    assert main(["calibrate", robot, shapes, *options]) == 0
+    screen = capsys.readouterr().out
+    assert "mass_per_length (kg/m)" in screen
+    assert ("youngs_modulus (Pa)" in screen) == (section == CIRCLE)
+    result = json.loads(record.read_text())
+    assert result["status"] == "converged"
+    after = {p["name"]: p["after"] for p in result["parameters"]}
+    assert after["mass_per_length"] == pytest.approx(0.252, rel=0.02)
+    written, read = out.read_bytes().decode(), read_robot(out)
+    assert float(read.rod.mass_per_length) == pytest.approx(after["mass_per_length"], rel=1e-8)
+    assert torch.allclose(read.rod.K_bt, after["stiffness_factor"] * read_robot(robot).rod.K_bt, rtol=1e-8)
+    assert [t.tension_offset for t in read.tendons.tendons] == pytest.approx(
+        [after[f"tension_offset_{j}"] for j in (1, 2)], rel=1e-8
+    )
+    old, new = text.split(end), written.split(end)
+    assert len(new) == len(old) + 1  # one tension_offset was added, indented like its table
+    assert sum(line.startswith("  tension_offset = ") for line in new) == 1
+    assert [line.partition("#")[2] for line in new if "#" in line] == [line.partition("#")[2] for line in old if "#" in line]
+    assert {line for line in old if "=" in line} - set(new) <= {
+        line for line in old if any(w in line for w in ("guess", "modulus", "zeroed", "K_"))
+    }
+    assert tomllib.loads(written)["name"] == "bench"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.json", "out.toml", "robot.toml", "shapes.csv"]
+
+
+def test_text_that_cannot_be_edited_leaves_no_file(tmp_path, capsys):
+    inline = "rod = {length = 0.4, diameter = 0.0014, youngs_modulus = 207e9, shear_modulus = 79e9, gravity = [9.81, 0, 0]}\n"
+    rod = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.144), gravity=SIDEWAYS)
+    s = torch.linspace(0.1, 0.4, 4)
+    robot, shapes = files(tmp_path, inline, Markers(s, solve_shape(rod, (), None, s, 1, STEPS).p))
+    out = tmp_path / "out.toml"
+    assert main(["calibrate", robot, shapes, "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "must be plain tables" in error
+    assert error.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["robot.toml", "shapes.csv"]
+
+
+def test_a_calibrated_robot_estimates_better(tmp_path):
+    """By the command line: mass and offsets from unloaded shapes, then the load on a loaded one."""
+    truth, load = two_tendons(offsets=OFFSETS), PointForces(T([[[0.6, -0.3, 0.0]]]), T([[0.4]]))
+    text = TOML.format(section="diameter = 0.002\nyoungs_modulus = 207e9\nshear_modulus = 79e9")
+    robot, shapes = files(tmp_path, text, shapes_of(truth, ROBOTS["two tendons"][2]))
+    out = str(tmp_path / "out.toml")
+    assert main(["calibrate", robot, shapes, "--noise", "2.5e-4", "--tension-offset", "--out", out]) == 0
+    s, tension = torch.linspace(0.07, 0.56, 8), T([[3.0, 2.0]])
+    p = solve_shape(truth, (load,), tension, s, 1, 40).p
+    loaded = Markers(s, p + NOISE * torch.randn(p.shape, generator=torch.Generator().manual_seed(9)), None, tension)
+    error = {}
+    for name in (robot, out):
+        model = read_robot(name)
+        fit = estimate(Model(model, GaussianCoordinates(1, 0.56, model.rod.force_scale, "point")), loaded, NOISE)
+        error[name] = float((fit.force[0, 0] - T([0.6, -0.3])).norm()), float((fit.location[0, 0] - 0.4).abs())
+        assert bool(fit.accepted[0]) == (name == out)
+    assert error[out][0] < 0.05
+    assert error[out][1] < 0.02
+    assert error[robot][0] > 3 * error[out][0]
+
+
+PASSIVE = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\ngravity = [9.81, 0, 0]\n"
+PULLED = PASSIVE + "[[tendons]]\noffset = [0.007, 0.0]\n"
+STRAIGHT = "s,x,y,z\n" + "".join(f"{0.1 * i:g},{0.01 * i * i:g},0,{0.1 * i:g}\n" for i in range(1, 5))
+SLACK = "s,x,y,z,tension_1\n0.2,0.01,0,0.2,0\n0.4,0.04,0,0.39,0\n"
+REFUSED = {
+    "no gravity": (PASSIVE.replace("gravity = [9.81, 0, 0]\n", ""), STRAIGHT, [], "add gravity = [x, y, z]"),
+    "ratio only": (PASSIVE, STRAIGHT, ["--youngs-modulus"], "drop --youngs-modulus"),
+    "slack only": (PULLED, SLACK, ["--youngs-modulus"], "add shapes with tension"),
+    "no tendons": (PASSIVE, STRAIGHT, ["--tension-offset"], "drop --tension-offset"),
+    "few markers": (
+        PULLED,
+        "s,x,y,z,tension_1\n0.4,0.1,0,0.3,1\n",
+        ["--youngs-modulus", "--tension-offset"],
+        "add markers or shapes",
+    ),
+    "no markers": (PASSIVE, "s,x,y,z\n0.2,,,\n0.4,,,\n", [], "add markers or shapes"),
+    "all crushed": (PULLED, SLACK.replace(",0\n", ",1e8\n"), [], "no sample has markers, finite tensions and an equilibrium"),
+    "noise": (PASSIVE, STRAIGHT, ["--noise", "0"], "from 1e-9 to 1"),
+    "iterations": (PASSIVE, STRAIGHT, ["--max-iterations", "0"], "must be a positive number"),
+    "out": (PASSIVE, STRAIGHT, ["--out", "robot.json"], "end in .toml"),
+    "json": (PASSIVE, STRAIGHT, ["--json", "no/such/r.json"], "create it first"),
+    "offset in the file": (PULLED + 'tension_offset = "1"\n', SLACK, [], "must be a number in SI units"),
+    "no shapes": (PASSIVE, None, [], "no such file"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refusals_are_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
+    robot, shapes, options, words = REFUSED[name]
+    monkeypatch.chdir(tmp_path)
+    Path("robot.toml").write_text(robot)
+    if shapes is not None:
+        Path("shapes.csv").write_text(shapes)
+    assert main(["calibrate", "robot.toml", "shapes.csv", *options]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.out == ""
+
+
+def test_what_is_not_known_is_not_written(tmp_path, capsys):
+    """Not converged: exit status 0, a message, no robot file; and a sample that is left out is named."""
+    markers = shapes_of(one_tendon(), ROBOTS["one tendon"][2])
+    markers.positions[3] = torch.nan
+    robot, shapes = files(tmp_path, PULLED, markers)
+    out, record = tmp_path / "out.toml", tmp_path / "out.json"
+    options = ["--max-iterations", "1", "--out", str(out), "--json", str(record)]
+    assert main(["calibrate", robot, shapes, *options]) == 0
+    captured = capsys.readouterr()
+    assert "Did not converge in 1 iterations" in captured.out
+    assert "sample shape-3 is left out" in captured.err
+    assert "out.toml: not written" in captured.err
+    assert not out.exists()
+    result = json.loads(record.read_text())
+    assert result["status"] == "not_converged"
+    assert result["left_out"] == ["shape-3"]
+    assert result["parameters"][0]["std"] is None

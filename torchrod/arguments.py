@@ -1,0 +1,30 @@
+"""Checks of arguments that several commands share. Each refusal is one sentence with the remedy."""
+
+import math
+from pathlib import Path
+
+from .errors import InputError
+
+
+def positive(name: str, value: float) -> None:
+    """Refuse what is not a positive number."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name} is {value}; it must be a positive number")
+
+
+def writable(path: str | None, suffixes: tuple[str, ...]) -> None:
+    """Refuse before the work, not after it."""
+    if path is None:
+        return
+    if Path(path).suffix not in suffixes:
+        raise InputError(f"{path}: cannot write this kind of file; let its name end in {' or '.join(suffixes)}")
+    if not Path(path).resolve().parent.is_dir():
+        raise InputError(f"{path}: its folder does not exist; create it first")
+    if Path(path).is_dir():
+        raise InputError(f"{path}: is a folder; give a file name")
+
+
+def noise_std(value: float) -> None:
+    """Refuse a standard deviation of the markers that no tracker has."""
+    if not 1e-9 <= value <= 1:
+        raise InputError(f"--noise is {value}; it must be a standard deviation in metres, from 1e-9 to 1")

@@ -1,0 +1,57 @@
+"""CALIBRATION.json: what torchrod calibrate found (docs/files.md)."""
+
+import json
+import math
+from pathlib import Path
+
+from ..calibration import Calibration
+from ..errors import InputError
+from ..unloaded import MASS, OFFSET
+
+CALIBRATION_SUFFIXES = (".json",)
+
+
+def unit_of(name: str) -> str:
+    """The unit of a calibrated parameter: kg/m, N, or 1 for a factor."""
+    return "kg/m" if name == MASS else "N" if name.startswith(OFFSET) else "1"
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no NaN: an unknown number is null."""
+    return value if math.isfinite(value) else None
+
+
+def write_calibration(path: str | Path, calibration: Calibration, samples: list[str], robot: str, noise: float) -> None:
+    """The record of a calibration as JSON. noise: as stated, m. Errors: InputError where the file cannot be written."""
+    c = calibration
+    content = {
+        "robot": robot,
+        "status": c.status.label,
+        "accepted": c.accepted,
+        "message": c.message,
+        "iterations": c.iterations,
+        "chi2": _plain(c.chi2),
+        "dof": c.dof,
+        "rms_residual_m": _plain(c.rms_residual),
+        "noise_m": noise,
+        "std_from": "residuals" if c.rescaled else "noise",
+        "samples": [name for name, used in zip(samples, c.used.tolist(), strict=True) if used],
+        "left_out": [name for name, used in zip(samples, c.used.tolist(), strict=True) if not used],
+        "parameters": [
+            {
+                "name": name,
+                "unit": unit_of(name),
+                "before": _plain(float(c.before[i])),
+                "after": _plain(float(c.values[i])),
+                "std": _plain(float(c.std[i])),
+                "std_noise": _plain(float(c.std_noise[i])),
+                "interval_95": [_plain(v) for v in c.interval_95[i].tolist()],
+                "determined": name not in c.undetermined,
+            }
+            for i, name in enumerate(c.names)
+        ],
+    }
+    try:
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None

@@ -1,0 +1,144 @@
+"""A calibrated ROBOT.toml: the text of the old one with only the calibrated values changed; comments and order are kept.
+
+The text is edited line by line, for robots written as [rod] and [[tendons]] tables with one key per line. Whatever else TOML allows
+is recognized afterwards: the new text is read back by `read_robot` and compared, so that a file that says something else is never
+written.
+"""
+
+import re
+import uuid
+import warnings
+from pathlib import Path
+
+import torch
+
+from ..errors import InputError
+from ..robot import Robot
+from .robot_file import read_robot
+
+HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([\w-]+)[ \t]*\]{1,2}[ \t]*(?:#.*)?$")
+NUMBER = re.compile(r"(?<![\w.+-])[+-]?\d[\d_]*(?:\.\d[\d_]*)?(?:[eE][+-]?\d[\d_]*)?(?![\w.])")
+STIFFNESS_KEYS = ("youngs_modulus", "shear_modulus", "K_se", "K_bt")
+DIGITS = 10  # written of a value: far below what any calibration knows
+SAME = 1e-8  # relative: the values read back are the calibrated ones
+
+
+def _plain(value: float) -> str:
+    return f"{value:.{DIGITS}g}"
+
+
+def _sections(lines: list[str], name: str) -> list[range]:
+    """Line numbers of the bodies of every table of this name."""
+    headers = [(i, match[1]) for i, line in enumerate(lines) if (match := HEADER.match(line.rstrip("\r\n")))]
+    ends = [i for i, _ in headers[1:]] + [len(lines)]
+    return [range(i + 1, end) for (i, found), end in zip(headers, ends, strict=False) if found == name]
+
+
+def _key_lines(lines: list[str], section: range, key: str) -> range:
+    """The lines of a key and its value, which goes on until its brackets are closed; empty where the table has no such key."""
+    for first in section:
+        if re.match(rf"^[ \t]*{key}[ \t]*=", lines[first]):
+            depth = 0
+            for last in range(first, section.stop):
+                code = lines[last].split("#")[0]
+                depth += code.count("[") - code.count("]")
+                if depth <= 0:
+                    return range(first, last + 1)
+    return range(section.stop, section.stop)
+
+
+def _with_numbers(lines: list[str], where: range, change) -> None:
+    """Every number of a value replaced, comments untouched."""
+    for i in where:
+        code, hash_, comment = lines[i].partition("#")
+        head, equals, value = code.partition("=") if i == where.start else ("", "", code)
+        lines[i] = (
+            head + equals + NUMBER.sub(lambda match: _plain(change(float(match[0].replace("_", "")))), value) + hash_ + comment
+        )
+
+
+def _put(lines: list[str], section: range, key: str, value: float) -> None:
+    """Change a number, or add the key after the last line of the table that says something."""
+    found = _key_lines(lines, section, key)
+    if found:
+        _with_numbers(lines, found, lambda _: value)
+        return
+    said = [i for i in section if lines[i].split("#")[0].strip()] or [section.start - 1]
+    end = "\r\n" if lines[said[0]].endswith("\r\n") else "\n"
+    if not lines[said[-1]].endswith("\n"):
+        lines[said[-1]] += end
+    indent = re.match(r"[ \t]*", lines[said[0]])
+    lines.insert(said[-1] + 1, f"{indent[0] if indent else ''}{key} = {_plain(value)}{end}")
+
+
+def calibrated_text(text: str, mass_per_length: float, stiffness_factor: float, offsets: tuple[float, ...] | None) -> str:
+    """ROBOT.toml's text with the mass per length (kg/m), its stiffnesses times a factor, and tension offsets (N) where given."""
+    lines = text.splitlines(keepends=True)
+    # From the end of the file to its start, so that the line numbers ahead of an added line stay true.
+    edits = [(section, None) for section in _sections(lines, "rod")]
+    if offsets is not None:
+        edits += list(zip(_sections(lines, "tendons"), offsets, strict=False))
+    for section, offset in sorted(edits, key=lambda edit: -edit[0].start):
+        if offset is not None:
+            _put(lines, section, "tension_offset", offset)
+            continue
+        if stiffness_factor != 1:
+            for key in STIFFNESS_KEYS:
+                _with_numbers(lines, _key_lines(lines, section, key), lambda value: stiffness_factor * value)
+        _put(lines, section, "mass_per_length", mass_per_length)
+    return "".join(lines)
+
+
+def _same(a: Robot, b: Robot) -> bool:
+    """Whether two robots are the same to SAME."""
+
+    def close(x: torch.Tensor, y: torch.Tensor) -> bool:
+        return x.shape == y.shape and torch.allclose(x, y, rtol=SAME, atol=0)
+
+    pairs = [(getattr(a.rod, key), getattr(b.rod, key)) for key in ("K_se", "K_bt", "mass_per_length", "reference_curvature")]
+    tendons = len(a.tendons) == len(b.tendons) and all(
+        t.routing == u.routing
+        and t.ends_at == u.ends_at
+        and abs(t.tension_offset - u.tension_offset) <= SAME * abs(t.tension_offset) + 1e-300
+        for t, u in zip(a.tendons.tendons, b.tendons.tendons, strict=True)
+    )
+    return a.rod.length == b.rod.length and tendons and all(close(x, y) for x, y in [*pairs, (a.gravity, b.gravity)])
+
+
+def write_calibrated(
+    path: str | Path,
+    source: str | Path,
+    robot: Robot,
+    stiffness_factor: float = 1.0,
+    tension_offset: bool = False,
+) -> None:
+    """Write `source` with the calibrated values of `robot`, as a whole or not at all, once it reads back as that robot.
+
+    Errors: InputError where the text cannot be edited (no file is left) or the folder cannot be written to.
+    """
+    path = Path(path).resolve()
+    # Bytes, because reading as text would turn the line ends of another system into this one's.
+    text = Path(source).read_bytes().decode("utf-8")
+    offsets = tuple(t.tension_offset for t in robot.tendons.tendons) if tension_offset else None
+    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.toml")
+    try:
+        beside.write_bytes(calibrated_text(text, float(robot.rod.mass_per_length), stiffness_factor, offsets).encode())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the source has raised them already
+            same = _reads_as(beside, robot)
+        if not same:
+            raise InputError(
+                f"{path}: not written; {source} must be plain tables, [rod] and [[tendons]] with one key = value per line"
+            )
+        beside.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _reads_as(path: Path, robot: Robot) -> bool:
+    try:
+        return _same(robot, read_robot(path))
+    except InputError:
+        return False
