@@ -16,7 +16,7 @@ SCRIPTS = sorted((ROOT / "scripts").rglob("*.py")) + sorted((ROOT / "training").
 LAYERS = [
     {"cli"},
     {"commands"},
-    {"calibrate_command"},
+    {"calibrate_command", "simulate_command"},
     {"arguments"},
     {"production"},
     {"io", "plot", "selection"},

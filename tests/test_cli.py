@@ -216,6 +216,9 @@ def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
         (["--tension", "1", "--seed", "-1"], "from 0 to 2^63"),
         (["--tension", "1", "--out", str(tmp_path / "s.npz")], "end in .csv"),
         (["--tension", "-1"], "at least 0 N"),
+        (["--tension", "1", "--displacement", "0.001"], "give one of them"),
+        (["--displacement", "0.001", "0.001"], "give one per tendon"),
+        (["--displacement", ".nan"], "must be finite"),
         (["--tension", "1", "--at", "0.1", "0.9"], "lie on the rod"),
         (["--tension", "1", "--point", "0.1", "x", "0"], "three numbers"),
         (["--tension", "1", "--point", "0.9", "1", "0"], "must lie on the rod"),
@@ -223,6 +226,19 @@ def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
         assert main(["simulate", robot, "--out", out, *options]) == 2
         assert words in capsys.readouterr().err
     assert not Path(out).exists()
+
+
+def test_a_displaced_tendon_is_simulated_with_its_tension(tmp_path, capsys):
+    """What --displacement writes, tensions included, is what --tension makes of those tensions."""
+    (tmp_path / "r.toml").write_text(TENDON)
+    robot, one, two = (str(tmp_path / name) for name in ("r.toml", "one.csv", "two.csv"))
+    assert main(["simulate", robot, "--displacement", "0.004", "--out", one]) == 0
+    tension = Path(one).read_text().splitlines()[1].split(",")[-1]
+    assert main(["simulate", robot, "--tension", tension, "--out", two]) == 0
+    first, second = ([[float(v) for v in r.split(",")] for r in Path(f).read_text().splitlines()[1:]] for f in (one, two))
+    assert max(abs(x - y) for a, b in zip(first, second, strict=True) for x, y in zip(a, b, strict=True)) < 1e-7
+    assert float(tension) > 0
+    assert "tensions" in capsys.readouterr().out
 
 
 def test_tension_columns_are_taken_by_their_number(tmp_path):

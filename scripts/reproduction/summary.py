@@ -55,8 +55,6 @@ def _tables(data: dict[str, Any]) -> list[str]:
         ours = data[table]
         cells = [f"{row['force_N_mean']:.3f} N / {100 * row['location_m_mean']:.2f} cm" for row in (ours, ours["without_mismatch"])]
         bound = f"{ours['bound_force_N_mean']:.3f} N / {100 * ours['bound_location_m_mean']:.2f} cm"
-        rows.append(
-            f"| Table {table}: mean errors, model a few percent wrong | {force} N / {100 * location:.2f} cm | {cells[0]} | |"
-        )
+        rows.append(f"| Table {table}: mean errors, model 3 % wrong | {force} N / {100 * location:.2f} cm | {cells[0]} | |")
         rows.append(f"| Table {table}: the same, model exact | | {cells[1]} | {bound} |")
     return rows
