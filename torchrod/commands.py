@@ -68,7 +68,7 @@ def estimate(options: Namespace) -> None:
 
     def model(k: int) -> Model:
         coordinates = GaussianCoordinates(k, rod.length, rod.force_scale, options.load_prior, locations)
-        return Model(robot, coordinates, options.registration, steps=options.steps)
+        return Model(robot, coordinates, options.registration, steps=options.steps, tip=options.unknown_tip)
 
     settings = Settings(max_iterations=options.max_iterations)
     try:
@@ -110,9 +110,17 @@ def _report(result: Estimate, samples: list[str]) -> str:
             place = f"{float(result.location[b, k]) * 1e3:.1f} +- {float(result.location_std[b, k]) * 1e3:.1f}"
             fx, fy = result.force[b, k].tolist()
             lines.append(f"{head}{k + 1:>4}{force:>20}{fx:>10.4f}{fy:>10.4f}{place:>20}{rms:>10.3f}")
+        if result.tip is not None and result.tip_covariance is not None:
+            std = result.tip_covariance[b].diagonal().sqrt().tolist()
+            both = [f"{v:.4f} +- {s:.4f}" for v, s in zip(result.tip[b].tolist(), std, strict=True) if s > 0 or math.isnan(s)]
+            lines.append(f"{'':>28} tip, base frame: force (N) {', '.join(both[:3])}" + _moment(both[3:]))
         if not result.accepted[b]:
             notes.append(f"sample {name}: {result.message(b)}")
     return "\n".join([*lines, *notes])
+
+
+def _moment(values: list[str]) -> str:
+    return f"; moment (N m) {', '.join(values)}" if values else ""
 
 
 def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: list[str]) -> None:

@@ -1,8 +1,9 @@
 """The measurement: markers on the rod, and the model h(x) of what they show.
 
-    x = [gamma, zeta, alpha]   ->   h(x) = [p_1 .. p_P, c]
+    x = [gamma, tip, zeta, alpha]   ->   h(x) = [p_1 .. p_P, c]
 
-gamma are the loads (torchrod.coordinates), zeta an optional registration twist, alpha the base wrench, c the tip residual (17).
+gamma are the loads (torchrod.coordinates), tip an optional unknown wrench at the tip, zeta an optional registration twist, alpha
+the base wrench, c the tip residual: what the section carries just beyond the tip (17), less R^T of the unknown wrench there.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from torch.func import jvp, vmap
 from .coordinates import LoadCoordinates
 from .grid import DEFAULT_STEPS
 from .jacobian import forward_jacobian
-from .lie import move, rotate
+from .lie import move, rotate, unrotate
 from .loads import LoadIntegrals, total
 from .march import march_linearized
 from .robot import Robot
@@ -25,6 +26,8 @@ from .step import Section
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
 TIP_EXACT = 10.0  # the covariance of the result takes the tip residual as this much stiffer
+TIP_UNKNOWNS = {"none": 0, "force": 3, "wrench": 6}
+TIP_STD = 10.0  # of the weak prior on the unknown tip force and moment about zero, in force and moment scales
 TURN_SCALE = 0.1  # rad, one unit of a registration angle; a unit of translation is this part of the rod's length
 
 
@@ -56,6 +59,8 @@ class Model:
     """h(x) for one robot, one parameterization and one marker layout.
 
     scaled: alpha in the rod's force and moment scales and zeta in tenths of L and of a radian; otherwise in SI (the paper's).
+    tip: "none", or the unknown dead "force" or "wrench" at the tip, in the base frame. It is known to the markers through the base
+    wrench alone, so it costs no tangent of the march.
     """
 
     robot: Robot
@@ -63,11 +68,17 @@ class Model:
     registration: bool = False
     scaled: bool = True
     steps: int = DEFAULT_STEPS
+    tip: str = "none"
+
+    @property
+    def load_size(self) -> int:
+        """How many entries of x are external loads: gamma and the unknown wrench at the tip."""
+        return self.coordinates.size + TIP_UNKNOWNS[self.tip]
 
     @property
     def size(self) -> int:
         """The length of x."""
-        return self.coordinates.size + 6 * self.registration + 6
+        return self.load_size + 6 * self.registration + 6
 
     def _scale_of(self, x: Tensor, first: float, second: float) -> Float[Tensor, " 6"]:
         return x.new_tensor([first] * 3 + [second] * 3) if self.scaled else x.new_ones(6)
@@ -80,15 +91,20 @@ class Model:
         self, x: Float[Tensor, "... n"]
     ) -> tuple[Float[Tensor, "... g"], Float[Tensor, "... 6"] | None, Float[Tensor, "... 6"]]:
         """gamma, zeta [m, rad] (None without registration) and alpha [N, N m]."""
-        gamma, zeta, alpha = x.tensor_split([self.coordinates.size, self.size - 6], -1)
+        gamma, _, zeta, alpha = x.tensor_split([self.coordinates.size, self.load_size, self.size - 6], -1)
         rod = self.robot.rod
         zeta = zeta * self._scale_of(x, TURN_SCALE * rod.length, TURN_SCALE) if self.registration else None
         return gamma, zeta, alpha * self.alpha_scale(x)
 
+    def tip_wrench(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 6"]:
+        """The unknown force (N) and moment (N m) at the tip, base frame; zero where they are not unknown."""
+        tip = x[..., self.coordinates.size : self.load_size]
+        return torch.nn.functional.pad(tip, (0, 6 - tip.shape[-1])) * self.alpha_scale(x)
+
     def join(self, gamma: Float[Tensor, "B g"], alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:
-        """x from loads and a base wrench (N, N m), with no registration error."""
-        zeta = alpha.new_zeros(alpha.shape[0], 6 * self.registration)
-        return torch.cat([gamma, zeta, alpha / self.alpha_scale(alpha)], -1)
+        """x from loads and a base wrench (N, N m), with nothing unknown at the tip and no registration error."""
+        between = alpha.new_zeros(alpha.shape[0], TIP_UNKNOWNS[self.tip] + 6 * self.registration)
+        return torch.cat([gamma, between, alpha / self.alpha_scale(alpha)], -1)
 
     def shape(self, x: Float[Tensor, "... n"], markers: Markers, differentiable: bool = True) -> Shape:
         """The rod at the markers' arc lengths, in its own base frame."""
@@ -106,7 +122,11 @@ class Model:
         _, zeta, _ = self.split(x)
         if zeta is not None:
             p = move(zeta, p)
-        return torch.cat([p.flatten(-2), shape.tip_residual], -1)
+        c = shape.tip_residual
+        if self.tip != "none":
+            wrench = self.tip_wrench(x).unflatten(-1, (2, 3))
+            c = c - unrotate(shape.tip_q.unsqueeze(-2), wrench).flatten(-2)
+        return torch.cat([p.flatten(-2), c], -1)
 
     def linearized(self, x: Float[Tensor, "B n"], markers: Markers) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """h(x) and H = dh/dx.
@@ -188,8 +208,9 @@ class Model:
         return torch.cat([w[:, :-6], TIP_EXACT**2 * w[:, -6:]], -1)
 
     def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Mean and precision of every entry of x: the loads' own; weak on zeta, none on alpha, which the tip residual holds."""
+        """Mean and precision of every entry of x: the loads' own; weak on tip and zeta, none on alpha, which (17) holds."""
         mean, precision = self.coordinates.prior()
-        extra = mean.new_zeros(6 * self.registration + 6)
-        held = torch.cat([extra[:-6] + 1e-4, extra[-6:]])
-        return torch.cat([mean, extra]), torch.cat([precision, held])
+        tip = mean.new_full((TIP_UNKNOWNS[self.tip],), TIP_STD**-2)
+        zeta, alpha = mean.new_full((6 * self.registration,), 1e-4), mean.new_zeros(6)
+        held = torch.cat([tip, zeta, alpha])
+        return torch.cat([mean, torch.zeros_like(held)]), torch.cat([precision, held])

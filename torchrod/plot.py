@@ -56,8 +56,11 @@ def _scene(robot: Robot, fit: Fit, tension: Tensor | None) -> _Scene:
     scale = ENVELOPE * L / float(height.max()) if float(height.max()) > 0 else 0.0
     force = torch.cat([fit.force, torch.zeros_like(fit.force[:, :1])], -1)
     at = [int((s - x).abs().argmin()) for x in fit.location]
-    longest = float(force.norm(dim=-1).max()) if len(force) else 0.0
-    tails = p[at] - rotate(q[at], force) * (ARROW * L / longest if longest > 0 else 0.0)
+    pushes = rotate(q[at], force)
+    if fit.tip_force is not None:
+        at, pushes = [*at, len(s) - 1], torch.cat([pushes, fit.tip_force.unsqueeze(0)])
+    longest = float(pushes.norm(dim=-1).max()) if len(pushes) else 0.0
+    tails = p[at] - pushes * (ARROW * L / longest if longest > 0 else 0.0)
     tendons = []
     for tendon in robot.tendons.tendons:
         r, _ = tendon.offset_at(s)
@@ -101,6 +104,8 @@ def _arrows(axes: Axes3D, scene: _Scene, colour: str, width: float, label: str, 
 
 
 def _label(fit: Fit, k: int) -> str:
+    if k == len(fit.force) and fit.tip_force is not None:
+        return f"{float(fit.tip_force.norm()):.3g} N at the tip"
     return f"{float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
 
 

@@ -31,8 +31,9 @@ class Estimate:
     where the fit has not converged.
     force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
     net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
-    base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line (B, P, 3) m: the fitted rod at the markers,
-    in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
+    tip (B, 6) [N, N m] and tip_covariance (B, 6, 6): the unknown dead wrench at the tip, base frame, zero in the entries that are
+    not unknown; None without Model.tip. base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line
+    (B, P, 3) m: the fitted rod at the markers, in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
     iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, from other magnitudes.
     chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
     """
@@ -44,6 +45,8 @@ class Estimate:
     width: Float[Tensor, "B K"]
     load_covariance: Float[Tensor, "B K 4 4"]
     net_force: Float[Tensor, "B K 2"]
+    tip: Float[Tensor, "B 6"] | None
+    tip_covariance: Float[Tensor, "B 6 6"] | None
     base_wrench: Float[Tensor, "B 6"]
     registration: Float[Tensor, "B 6"] | None
     centre_line: Float[Tensor, "B P 3"]
@@ -117,9 +120,9 @@ class Estimate:
         """What a figure needs of one sample."""
         zeta = None if self.registration is None else self.registration[sample]
         there = torch.isfinite(self.location[sample])
-        return Fit(
-            self.force[sample][there], self.location[sample][there], self.width[sample][there], self.base_wrench[sample], zeta
-        )
+        tip = None if self.tip is None else self.tip[sample, :3]
+        loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
+        return Fit(*loads, self.base_wrench[sample], zeta, tip)
 
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
         """With the samples of `index` replaced by those of another attempt where its cost is lower; every attempt is counted."""
@@ -148,7 +151,8 @@ class Estimate:
 @dataclass(frozen=True)
 class Fit:
     """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
-    wrench (6,) [N, N m], and the registration (6,) [m, rad] that carries the rod into the measured frame, or None.
+    wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, and the unknown
+    force (3,) N at the tip in the base frame, or None.
     """
 
     force: Float[Tensor, "K 2"]
@@ -156,6 +160,7 @@ class Fit:
     width: Float[Tensor, " K"]
     base_wrench: Float[Tensor, " 6"]
     registration: Float[Tensor, " 6"] | None = None
+    tip_force: Float[Tensor, " 3"] | None = None
 
     def loads(self, length: float) -> tuple[Load, ...]:
         """The loads as torchrod.loads has them."""
@@ -187,6 +192,15 @@ def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Ten
     _, J = forward_jacobian(described, x[:, :n])
     J = J.unflatten(1, (-1, 4))
     return J @ covariance[:, None, :n, :n] @ J.transpose(-1, -2)
+
+
+def tip_covariance(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B 6 6"]:
+    """Covariance of the unknown wrench at the tip [N, N m]; zero in the entries that are not unknown."""
+    first, last = model.coordinates.size, model.load_size
+    scale = model.alpha_scale(covariance)
+    block = covariance[:, first:last, first:last]
+    rest = 6 - (last - first)
+    return torch.nn.functional.pad(block, (0, rest, 0, rest)) * scale * scale.unsqueeze(-1)
 
 
 def make_estimate(
@@ -224,6 +238,8 @@ def make_estimate(
         width=kept(report.width),
         load_covariance=settled(load_covariance(model, x, covariance)),
         net_force=kept(report.net_force),
+        tip=None if model.tip == "none" else kept(model.tip_wrench(x)),
+        tip_covariance=None if model.tip == "none" else settled(tip_covariance(model, covariance)),
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
         centre_line=kept(model.shape(x, markers, differentiable=False).p),

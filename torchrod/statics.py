@@ -76,11 +76,15 @@ def base_state(robot: Robot, alpha: Float[Tensor, "... 6"], table: StageTable) -
 
 @dataclass(frozen=True)
 class Shape:
-    """The rod at the outputs: p (..., P, 3) m, q (..., P, 4), and the tip residual c (..., 6) [N, N m], section frame."""
+    """The rod at the outputs: p (..., P, 3) m, q (..., P, 4), and the tip residual c (..., 6) [N, N m], section frame.
+
+    tip_q: (..., 4), the orientation of the last section.
+    """
 
     p: Float[Tensor, "... P 3"]
     q: Float[Tensor, "... P 4"]
     tip_residual: Float[Tensor, "... 6"]
+    tip_q: Float[Tensor, "... 4"]
 
 
 def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadIntegrals) -> Shape:
@@ -90,7 +94,7 @@ def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadI
     """
     p, q, N, M = states.split(STATE_PARTS, -1)
     c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond)
-    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1))
+    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :])
 
 
 def shape_from_base(

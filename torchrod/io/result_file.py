@@ -64,6 +64,10 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
         "loads": _loads(estimate, b),
         "base_wrench": {"force_N": wrench[:3], "moment_Nm": wrench[3:]},
     }
+    if estimate.tip is not None and estimate.tip_covariance is not None:
+        tip = [_plain(v) for v in estimate.tip[b].tolist()]
+        std = [_plain(v) for v in estimate.tip_covariance[b].diagonal().clamp(min=0).sqrt().tolist()]
+        record["tip"] = {"force_N": tip[:3], "moment_Nm": tip[3:], "std": {"force_N": std[:3], "moment_Nm": std[3:]}}
     if estimate.registration is not None:
         twist = [_plain(v) for v in estimate.registration[b].tolist()]
         record["registration"] = {"translation_m": twist[:3], "rotation_rad": twist[3:]}
@@ -101,7 +105,9 @@ def read_fit(path: str | Path, sample: str) -> Fit:
             with np.load(path, allow_pickle=False) as file:
                 names = [str(n) for n in file["sample"]]
                 b = _index(path, names, sample)
-                values = [file[key][b] for key in ("force", "location", "width", "base_wrench", "registration") if key in file]
+                values = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
+                zeta = file["registration"][b] if "registration" in file else None
+                tip = file["tip"][b][:3] if "tip" in file else None
         else:
             results = json.loads(path.read_text(encoding="utf-8"))["results"]
             names = [str(r["sample"]) for r in results]
@@ -109,15 +115,18 @@ def read_fit(path: str | Path, sample: str) -> Fit:
             loads, wrench = record["loads"], record["base_wrench"]
             values = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
             values.append([*wrench["force_N"], *wrench["moment_Nm"]])
-            if "registration" in record:
-                values.append([*record["registration"]["translation_m"], *record["registration"]["rotation_rad"]])
-        tensors = [torch.tensor(np.array(v, dtype=float)) for v in values]
+            twist = record.get("registration")
+            zeta = None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]]
+            tip = record["tip"]["force_N"] if "tip" in record else None
+        tensors = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in (*values, zeta, tip)]
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: is not a result of torchrod estimate ({error}); write it with --out") from None
-    there = torch.isfinite(tensors[0].reshape(-1, 2)).all(-1)
-    tensors[:3] = [tensors[0].reshape(-1, 2)[there], tensors[1][there], tensors[2][there]]
-    if not all(bool(torch.isfinite(t).all()) for t in tensors):
+    force, location, width, *rest = tensors
+    assert force is not None and location is not None and width is not None
+    there = torch.isfinite(force.reshape(-1, 2)).all(-1)
+    loads = [force.reshape(-1, 2)[there], location[there], width[there]]
+    if not all(bool(torch.isfinite(t).all()) for t in [*loads, *rest] if t is not None):
         raise InputError(f"{path}: sample {sample} has no fit to draw; see its message")
-    return Fit(*tensors)
+    return Fit(*loads, *rest)  # pyright: ignore[reportArgumentType]
