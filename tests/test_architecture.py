@@ -19,7 +19,7 @@ LAYERS = [
     {"production"},
     {"io", "plot", "selection"},
     {"estimator"},
-    {"result"},
+    {"result", "starts"},
     {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},
     {"march"},
