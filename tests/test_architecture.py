@@ -23,7 +23,7 @@ LAYERS = [
     {"calibration"},
     {"unloaded"},
     {"estimator"},
-    {"result"},
+    {"result", "starts"},
     {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},
     {"march"},

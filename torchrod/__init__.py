@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .dataset import DatasetSpec, simulate_shard
     from .errors import InputError
-    from .estimator import Settings, cold_start, estimate, paper_settings
+    from .estimator import Settings, estimate, paper_settings
     from .io import Dataset, Shapes, read_dataset, read_dataset_spec, read_robot, read_shapes, write_result, write_shapes
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .result import Estimate, Fit
     from .robot import Robot
     from .rod import Rod
+    from .starts import Start, cold_start
     from .statics import Equilibrium, Shape, shape_from_base, solve_shape
     from .status import Status
     from .tendons import Tendon, Tendons
@@ -33,7 +34,7 @@ _HOMES = {
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "dataset": ("DatasetSpec", "simulate_shard"),
     "errors": ("InputError",),
-    "estimator": ("Settings", "cold_start", "estimate", "paper_settings"),
+    "estimator": ("Settings", "estimate", "paper_settings"),
     "io": (
         "Dataset",
         "Shapes",
@@ -51,6 +52,7 @@ _HOMES = {
     "result": ("Estimate", "Fit"),
     "robot": ("Robot",),
     "rod": ("Rod",),
+    "starts": ("Start", "cold_start"),
     "statics": ("Equilibrium", "Shape", "shape_from_base", "solve_shape"),
     "status": ("Status",),
     "tendons": ("Tendon", "Tendons"),
@@ -80,6 +82,7 @@ __all__ = [
     "Settings",
     "Shape",
     "Shapes",
+    "Start",
     "Status",
     "Tendon",
     "Tendons",

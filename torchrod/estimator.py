@@ -9,12 +9,11 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import PaperCoordinates
-from .loads import Load
 from .measurement import Markers, Model
 from .result import Estimate, make_estimate
 from .rod import DTYPE
-from .statics import solve_shape
-from .status import Status
+from .starts import Start, StartRule, better_start, cold_start, equilibrium_wrench, residual_and_cost
+from .status import Learned, Status
 
 CHUNK = 256  # samples per pass: the working set of one iteration stays in cache
 DECREMENT = 1e-3  # converged: a further step promises to lower the cost (chi^2) by less than this,
@@ -40,6 +39,10 @@ class Settings:
     max_iterations: int = 100
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
 
+    def initial_covariance(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "n n"]:
+        """Sigma0 as a matrix."""
+        return torch.diag(self.Sigma0 * x.new_ones(x.shape[-1]))
+
 
 def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
     """The paper's plain recursion: no step limit, no adaptive noise.
@@ -51,17 +54,6 @@ def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Setting
     size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
     size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
     return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, 500, ())
-
-
-def equilibrium_wrench(model: Model, loads: tuple[Load, ...], markers: Markers) -> Float[Tensor, "B 6"]:
-    """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found."""
-    shape = solve_shape(model.robot, loads, markers.tension, markers.s[-1:], len(markers.positions), model.steps)
-    return shape.base_wrench.nan_to_num(0.0)
-
-
-def cold_start(model: Model, markers: Markers) -> Float[Tensor, "B n"]:
-    """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
-    return model.join(model.coordinates.start().expand(len(markers.positions), -1), equilibrium_wrench(model, (), markers))
 
 
 @dataclass(frozen=True)
@@ -79,11 +71,8 @@ class Linearized:
 def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[Tensor, "B z"]) -> Linearized:
     """r = z - h(x) (zero where a marker is missing), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
     h, H = model.linearized(x, markers)
-    z = torch.cat([markers.positions.flatten(1), h.new_zeros(len(h), 6)], -1)
-    r = torch.where(w > 0, z - h, 0.0)
-    mean, precision = model.prior()
-    A, g = ekf.information(H, r, w, x, mean, precision)
-    cost = (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+    r, cost = residual_and_cost(model, markers, w, x, h)
+    A, g = ekf.information(H, r, w, x, *model.prior())
     return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
 
 
@@ -100,18 +89,18 @@ def _silent(_: int) -> None:
 
 
 def _filter(
-    model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"], progress: Callable[[int], object]
+    model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
 ) -> Estimate:
     """Iterate one chunk. Samples leave the batch when they have converged; a failed one never touches its neighbours."""
     w = model.weights(markers, noise)
-    diagonal = torch.ones(model.size, dtype=x.dtype)
-    Sigma0, Q = torch.diag(settings.Sigma0 * diagonal), settings.Q * diagonal
+    x, before = start.x.clone(), start.x.clone()
+    Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
+    Sigma, Q = Sigma0.clone(), settings.Q * x.new_ones(model.size)
     mean, precision = model.prior()
     B = len(x)
     ok = usable(model, markers)
     status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
     iterations = torch.zeros(B, dtype=torch.int64)
-    x, before, Sigma = x.clone(), x.clone(), Sigma0.expand(B, -1, -1).clone()
     cap, P3 = x.new_full((B,), torch.inf if settings.adaptive else 0.0), 3 * len(markers.s)
     live = ok.nonzero().squeeze(-1)
     for _ in range(settings.max_iterations):
@@ -136,18 +125,35 @@ def _filter(
         onward = torch.where(finite.unsqueeze(-1), onward, 0.5 * (x[live] + before[live]))
         before[live] = torch.where(finite.unsqueeze(-1), x[live], before[live])
         x[live] = torch.where(done.unsqueeze(-1), x[live], onward)
-        Sigma[live] = torch.where(fresh[:, None, None], Sigma_next, Sigma0)
+        Sigma[live] = torch.where(fresh[:, None, None], Sigma_next, Sigma0[live])
         progress(int(done.sum()))
         live = live[~done]
     progress(len(live) + int((~ok).sum()))
-    return make_estimate(model, markers, w, x, linearize(model, x, markers, w), status, iterations)
+    return make_estimate(model, markers, w, x, linearize(model, x, markers, w), status, iterations, start.warm)
+
+
+def _from_guess(
+    model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
+) -> Estimate:
+    """One chunk from its start: a guess that costs less than a cold start; cold also where it leads to no accepted fit."""
+    chosen, dropped = better_start(model, markers, noise, start, settings.initial_covariance(start.x))
+    fit = _filter(model, markers, noise, settings, chosen, progress)
+    failed = chosen.warm & ~fit.accepted & usable(model, markers)
+    learned = torch.where(start.warm, int(Learned.USED), int(Learned.NONE))
+    learned[dropped], learned[failed] = int(Learned.DROPPED), int(Learned.RETRIED)
+    fit = replace(fit, learned=learned)
+    index = failed.nonzero().squeeze(-1)
+    if not len(index):
+        return fit
+    part = markers.take(index)
+    return fit.improved_by(_filter(model, part, noise, settings, cold_start(model, part, noise), _silent), index)
 
 
 def _with_restarts(
-    model: Model, markers: Markers, noise: float, settings: Settings, x: Float[Tensor, "B n"], progress: Callable[[int], object]
+    model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
 ) -> Estimate:
     """One chunk, and again from other magnitudes where the fit is not accepted."""
-    fit = _filter(model, markers, noise, settings, x, progress)
+    fit = _from_guess(model, markers, noise, settings, start, progress)
     again = replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS))
     for factor in settings.restarts if model.coordinates.size else ():
         index = (~fit.accepted & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
@@ -155,8 +161,8 @@ def _with_restarts(
             break
         part = markers.take(index)
         gamma = model.coordinates.rescaled(fit.x[index, : model.coordinates.size], factor)
-        alpha = equilibrium_wrench(model, model.coordinates.loads(gamma), part)
-        other = _filter(model, part, noise, again, model.join(gamma, alpha), _silent)
+        x = model.join(gamma, equilibrium_wrench(model, model.coordinates.loads(gamma), part))
+        other = _filter(model, part, noise, again, Start(x, None, torch.zeros(len(x), dtype=torch.bool)), _silent)
         fit = fit.improved_by(other, index)
     return fit
 
@@ -166,21 +172,23 @@ def estimate(
     markers: Markers,
     noise: float,
     settings: Settings | None = None,
-    start: Callable[[Model, Markers], Float[Tensor, "B n"]] = cold_start,
+    start: StartRule = cold_start,
     progress: Callable[[int], object] = _silent,
 ) -> Estimate:
     """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
 
-    noise: standard deviation of a marker coordinate (m). start: initial x. progress: called as samples finish, with their number.
-    A sample's answer does not depend on its batch. Errors: ValueError for markers that do not fit the robot; a sample that cannot
-    be estimated is reported by its status. Source: the paper, section II; DESIGN.md section 3.
+    noise: standard deviation of a marker coordinate (m). start: where to start, from (model, markers, noise); a guess that is no
+    nearer to the data than a cold start is dropped, and one that leads to no accepted fit is followed by a cold start.
+    progress: called as samples finish, with their number. A sample's answer does not depend on its batch.
+    Errors: ValueError for markers that do not fit the robot; a sample that cannot be estimated is reported by its status.
+    Source: the paper, section II; DESIGN.md section 3.
     """
     check(model, markers, noise)
     parts = []
     for first in range(0, len(markers.positions), CHUNK):
         index = torch.arange(first, min(first + CHUNK, len(markers.positions)))
         part = markers.take(index)
-        parts.append(_with_restarts(model, part, noise, settings or Settings(), start(model, part), progress))
+        parts.append(_with_restarts(model, part, noise, settings or Settings(), start(model, part, noise), progress))
     return Estimate.cat(parts)
 
 

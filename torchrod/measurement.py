@@ -112,9 +112,9 @@ class Model:
         loads = self.coordinates.loads(gamma)
         return shape_from_base(self.robot, loads, alpha, markers.tension, markers.s, self.steps, differentiable)
 
-    def h(self, x: Float[Tensor, "... n"], markers: Markers) -> Float[Tensor, "... z"]:
+    def h(self, x: Float[Tensor, "... n"], markers: Markers, differentiable: bool = True) -> Float[Tensor, "... z"]:
         """[p_1 .. p_P (m), c (N, N m)], (..., 3 P + 6): marker positions in the measured frame, then the tip residual."""
-        return self._seen(self.shape(x, markers), x, markers)
+        return self._seen(self.shape(x, markers, differentiable), x, markers)
 
     def _seen(self, shape: Shape, x: Float[Tensor, "... n"], markers: Markers) -> Float[Tensor, "... z"]:
         """What the markers show of a shape."""

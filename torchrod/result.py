@@ -14,7 +14,7 @@ from .coordinates import LoadReport
 from .jacobian import forward_jacobian
 from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from .measurement import Markers, Model
-from .status import Status
+from .status import Learned, Status
 
 if TYPE_CHECKING:
     from .estimator import Linearized
@@ -34,7 +34,8 @@ class Estimate:
     tip (B, 6) [N, N m] and tip_covariance (B, 6, 6): the unknown dead wrench at the tip, base frame, zero in the entries that are
     not unknown; None without Model.tip. base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line
     (B, P, 3) m: the fitted rod at the markers, in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
-    iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, from other magnitudes.
+    iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, cold or from other magnitudes.
+    warm_started (B,): whether the fit that is reported started from a guess; learned (B,): torchrod.status.Learned codes.
     chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
     """
 
@@ -57,6 +58,8 @@ class Estimate:
     iterations: Int[Tensor, " B"]
     restarts: Int[Tensor, " B"]
     status: Int[Tensor, " B"]
+    warm_started: Bool[Tensor, " B"]
+    learned: Int[Tensor, " B"]
 
     @property
     def magnitude(self) -> Float[Tensor, "B K"]:
@@ -107,7 +110,10 @@ class Estimate:
         return self.residual.square().sum(-1).nanmean(-1).sqrt()
 
     def message(self, sample: int) -> str:
-        """One sentence on what became of a sample, with the remedy."""
+        """What became of a sample, with the remedy; a second sentence where a learned start did not serve."""
+        return f"{self._outcome(sample)} {Learned(int(self.learned[sample])).message}".strip()
+
+    def _outcome(self, sample: int) -> str:
         status = Status(int(self.status[sample]))
         if status is Status.CONVERGED and not self.accepted[sample]:
             return (
@@ -125,14 +131,19 @@ class Estimate:
         return Fit(*loads, self.base_wrench[sample], zeta, tip)
 
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
-        """With the samples of `index` replaced by those of another attempt where its cost is lower; every attempt is counted."""
-        better = other.chi2 < self.chi2[index].nan_to_num(torch.inf)
+        """With the samples of `index` replaced by those of another attempt where that is better; every attempt is counted.
+
+        Better: accepted where this one is not, else of lower cost.
+        """
+        was, lower = self.accepted[index], other.chi2 < self.chi2[index].nan_to_num(torch.inf)
+        better = (other.accepted & ~was) | ((other.accepted == was) & lower)
         changed = {}
         for f in fields(Estimate):
             value = getattr(self, f.name)
             if value is not None:
                 changed[f.name] = value.clone()
                 changed[f.name][index[better]] = getattr(other, f.name)[better]
+        changed["learned"] = self.learned
         changed["iterations"] = self.iterations.index_add(0, index, other.iterations)
         changed["restarts"] = self.restarts.index_add(0, index, torch.ones_like(index))
         return replace(self, **changed)
@@ -211,6 +222,7 @@ def make_estimate(
     at: "Linearized",
     status: Int[Tensor, " B"],
     iterations: Int[Tensor, " B"],
+    warm_started: Bool[Tensor, " B"],
 ) -> Estimate:
     """Assemble the result from the last linearization; a sample that is invalid holds NaN throughout."""
     valid = (status != int(Status.INVALID)) & torch.isfinite(at.cost)
@@ -250,4 +262,6 @@ def make_estimate(
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,
+        warm_started=warm_started,
+        learned=torch.full_like(iterations, int(Learned.NONE)),
     )

@@ -1,4 +1,4 @@
-"""What became of a sample, and what its owner can do about it."""
+"""What became of a sample and of its learned start, and what its owner can do about it."""
 
 from enum import IntEnum
 
@@ -25,4 +25,24 @@ _MESSAGES = {
     Status.CONVERGED: "Converged.",
     Status.NOT_CONVERGED: "Did not converge: check units, marker order and tensions; then state more noise or more iterations.",
     Status.INVALID: "Not enough finite numbers: give this sample more markers and finite tensions, or fewer unknown loads.",
+}
+
+
+class Learned(IntEnum):
+    """What became of a sample's learned start; `.message` says so where it was not simply used."""
+
+    NONE = 0
+    USED = 1
+    DROPPED = 2
+    RETRIED = 3
+
+    @property
+    def message(self) -> str:
+        """One sentence, or nothing."""
+        return _LEARNED.get(self, "")
+
+
+_LEARNED = {
+    Learned.DROPPED: "The learned start was no nearer to the markers than a cold one and was dropped.",
+    Learned.RETRIED: "The fit from the learned start was not accepted, so a cold start was tried as well.",
 }

@@ -57,7 +57,7 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
         "message": estimate.message(b),
         "iterations": int(estimate.iterations[b]),
         "restarts": int(estimate.restarts[b]),
-        "warm_started": False,
+        "warm_started": bool(estimate.warm_started[b]),
         "chi2": _plain(float(estimate.chi2[b])),
         "dof": int(estimate.dof[b]),
         "rms_residual_m": _plain(float(estimate.rms_residual[b])),

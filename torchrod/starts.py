@@ -1,0 +1,78 @@
+"""Where the filter starts: from no load, or from a guess that must first show that it is nearer to the data than that."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .loads import Load
+from .measurement import Markers, Model
+from .statics import solve_shape
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where B samples start: x (B, n) in the model's coordinates.
+
+    Sigma0: the covariance (B, n, n) to start with; None leaves it to the settings. warm: (B,), which samples start from a guess;
+    the others start cold, from no load.
+    """
+
+    x: Float[Tensor, "B n"]
+    Sigma0: Float[Tensor, "B n n"] | None
+    warm: Bool[Tensor, " B"]
+
+
+StartRule = Callable[[Model, Markers, float], Start]
+
+
+def equilibrium_wrench(model: Model, loads: tuple[Load, ...], markers: Markers) -> Float[Tensor, "B 6"]:
+    """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found."""
+    shape = solve_shape(model.robot, loads, markers.tension, markers.s[-1:], len(markers.positions), model.steps)
+    return shape.base_wrench.nan_to_num(0.0)
+
+
+def cold_start(model: Model, markers: Markers, noise: float) -> Start:
+    """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
+    B = len(markers.positions)
+    x = model.join(model.coordinates.start().expand(B, -1), equilibrium_wrench(model, (), markers))
+    return Start(x, None, torch.zeros(B, dtype=torch.bool))
+
+
+def residual_and_cost(
+    model: Model, markers: Markers, w: Float[Tensor, "B z"], x: Float[Tensor, "B n"], h: Float[Tensor, "B z"]
+) -> tuple[Float[Tensor, "B z"], Float[Tensor, " B"]]:
+    """r = z - h(x), zero where a marker is missing, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
+    z = torch.cat([markers.positions.flatten(1), h.new_zeros(len(h), 6)], -1)
+    r = torch.where(w > 0, z - h, 0.0)
+    mean, precision = model.prior()
+    return r, (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+
+
+def better_start(
+    model: Model, markers: Markers, noise: float, start: Start, Sigma0: Float[Tensor, "n n"]
+) -> tuple[Start, Bool[Tensor, " B"]]:
+    """Per warm sample, the cheaper of its guess and a cold start, and which guesses were dropped, (B,).
+
+    Sigma0 is what a cold start goes with. Each costs one evaluation of h without its Jacobian. A guess that is not finite, or that
+    bends the rod out of all bounds, is dropped with the rest.
+    """
+    index = start.warm.nonzero().squeeze(-1)
+    if not len(index):
+        return start, start.warm
+    part = markers.take(index)
+    w = model.weights(part, noise)
+    cold = cold_start(model, part, noise)
+
+    def cost(x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        value = residual_and_cost(model, part, w, x, model.h(x, part, differentiable=False))[1]
+        return value.nan_to_num(torch.inf)
+
+    worse = ~(cost(start.x[index]) < cost(cold.x))
+    dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
+    x = start.x.clone()
+    x[dropped] = cold.x[worse]
+    spread = None if start.Sigma0 is None else torch.where(dropped[:, None, None], Sigma0, start.Sigma0)
+    return Start(x, spread, start.warm & ~dropped), dropped
