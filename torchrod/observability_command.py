@@ -11,7 +11,7 @@ from torch import Tensor
 from .arguments import noise_std, positive, writable
 from .errors import InputError
 from .io import read_robot, write_observability, write_observability_table
-from .observability import LOCALIZED, Observability, bounds
+from .observability import BENDS, LOCALIZED, Observability, bounds
 from .placement import Placement, even_layout, place
 from .robot import Robot
 from .rod import DTYPE
@@ -126,6 +126,8 @@ def _report(robot: Robot, seen: Observability, s: Tensor, options: Namespace, pl
         cells = [_short(float(x[k]), most) for x, most in zip(worst, (math.inf, math.inf, math.inf, 1e3 * L), strict=True)]
         lines.append(f"{1e3 * float(seen.location[k]):>8.1f}" + "".join(f"{cell:>18}" for cell in cells))
     lines.append(f"detected: found 95 % of the time, 5 % false alarms; located: standard deviation {LOCALIZED:.0%} of the length")
+    if bool(torch.isinf(seen.localizable).any()):
+        lines.append(f"none: not even where the push turns the rod by {BENDS[-1]:g} rad")
     return "\n".join(lines)
 
 
