@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
     from .measurement import Markers, Model
+    from .observability import Observability, bounds, load_bound
+    from .placement import Placement, place
     from .plot import draw, draw_on
     from .result import Estimate, Fit
     from .robot import Robot
@@ -48,6 +50,8 @@ _HOMES = {
     "jacobian": ("forward_jacobian",),
     "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),
     "measurement": ("Markers", "Model"),
+    "observability": ("Observability", "bounds", "load_bound"),
+    "placement": ("Placement", "place"),
     "plot": ("draw", "draw_on"),
     "result": ("Estimate", "Fit"),
     "robot": ("Robot",),
@@ -72,7 +76,9 @@ __all__ = [
     "InputError",
     "Markers",
     "Model",
+    "Observability",
     "PaperCoordinates",
+    "Placement",
     "PointCoordinates",
     "PointForces",
     "PointWrenches",
@@ -86,13 +92,16 @@ __all__ = [
     "Status",
     "Tendon",
     "Tendons",
+    "bounds",
     "calibrate",
     "cold_start",
     "draw",
     "draw_on",
     "estimate",
     "forward_jacobian",
+    "load_bound",
     "paper_settings",
+    "place",
     "read_dataset",
     "read_dataset_spec",
     "read_robot",

@@ -62,6 +62,26 @@ def _calibrate_parser() -> ArgumentParser:
     return parser
 
 
+def _observability_parser() -> ArgumentParser:
+    parser = _Parser(description="What markers will see of a push along the rod, before any measurement, and where to put them.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument("--markers", type=int, default=None, help="number of markers, evenly spaced, the last at the tip (20)")
+    _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
+    parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
+    parser.add_argument(
+        "--force", type=float, default=None, help="the push (N); by default one that bends the rod visibly, 4 EI/L^2"
+    )
+    _number_list(parser, "--tension", "tensions T1 T2 ... (N), one per tendon")
+    parser.add_argument("--registration", action="store_true", help="the base frame is not known either")
+    parser.add_argument("--place", type=int, default=None, help="propose places for so many markers, instead of --markers")
+    parser.add_argument("--from", type=float, default=None, help="with --place: the push nearest the base (m); 10 %% of the length")
+    parser.add_argument("--gap", type=float, default=None, help="with --place: least distance of markers (m); 2 %% of the length")
+    parser.add_argument("--out", type=str, default=None, help="FIGURE.png")
+    parser.add_argument("--csv", type=str, default=None, help="TABLE.csv")
+    parser.add_argument("--json", type=str, default=None, help="RESULT.json")
+    return parser
+
+
 def _simulate_parser() -> ArgumentParser:
     parser = _Parser(description="The shape of a robot under known loads, as marker positions.")
     parser.add_argument("robot", type=str, help="ROBOT.toml")
@@ -111,6 +131,7 @@ def _plot_parser() -> ArgumentParser:
 COMMANDS = {
     "estimate": (_estimate_parser, "loads from marker positions"),
     "calibrate": (_calibrate_parser, "mass per length from unloaded shapes"),
+    "observability": (_observability_parser, "what markers will see, and where to put them"),
     "simulate": (_simulate_parser, "marker positions from known loads"),
     "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
     "plot": (_plot_parser, "a figure of an estimate"),

@@ -21,13 +21,14 @@ from .io import (
     write_result,
 )
 from .measurement import Markers, Model
+from .observability_command import observability
 from .result import Estimate
 from .robot import Robot
 from .selection import select_count
 from .simulate_command import simulate, simulate_dataset
 from .status import Status
 
-__all__ = ["calibrate", "estimate", "plot", "simulate", "simulate_dataset"]
+__all__ = ["calibrate", "estimate", "observability", "plot", "simulate", "simulate_dataset"]
 
 MAX_CONTACTS = 3
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")

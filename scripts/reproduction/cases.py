@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchrod import Estimate, GaussianCoordinates, Markers, Model, PointForces, Robot, Rod, estimate, solve_shape
+from torchrod import Estimate, GaussianCoordinates, Markers, Model, PointForces, Robot, Rod, estimate, load_bound, solve_shape
 
 L = 0.4
 S = torch.linspace(0.02, L, 20, dtype=torch.float64)
@@ -43,29 +43,8 @@ class Study:
 
     def bound(self, noise: float, width_known: bool) -> tuple[Tensor, Tensor]:
         """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N)."""
-        return load_bound(self.robot, Markers(S, self.positions), self.force, self.location, self.base_wrench, noise, width_known)
-
-
-def load_bound(
-    robot: Robot, markers: Markers, force: Tensor, location: Tensor, base_wrench: Tensor, noise: float, width_known: bool
-) -> tuple[Tensor, Tensor]:
-    """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N), alpha unknown, for a load 1 mm wide.
-
-    (H^T W H)^-1 at the truth, without any prior; with the width unknown its column stays in.
-    """
-    L, scale = robot.rod.length, robot.rod.force_scale
-    model = Model(robot, GaussianCoordinates(1, L, scale, "none"))
-    t = location / L
-    log_c = torch.full_like(t, math.log(0.5 * (L / 1e-3) ** 2))
-    gamma = torch.cat([force / scale, torch.logit(t).unsqueeze(-1), log_c.unsqueeze(-1)], -1)
-    _, H = model.linearized(model.join(gamma, base_wrench), markers)
-    if width_known:
-        H = torch.cat([H[..., :3], H[..., 4:]], -1)
-    w = model.weights(markers, noise)
-    C = torch.linalg.inv(H.mT @ (w.unsqueeze(-1) * H))
-    along = force / force.norm(dim=-1, keepdim=True)
-    magnitude = (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten().sqrt() * scale
-    return C[:, 2, 2].sqrt() * L * t * (1 - t), magnitude
+        markers = Markers(S, self.positions)
+        return load_bound(self.robot, markers, self.force, self.location, self.base_wrench, noise, width_known=width_known)
 
 
 def mean_error(bounds: list[float]) -> float:

@@ -16,10 +16,9 @@ from torchrod import (
     Tendon,
     Tendons,
     estimate,
+    load_bound,
     solve_displacement,
 )
-
-from .cases import load_bound
 
 NOISE = 0.25e-3  # m
 MARKERS = 8
@@ -65,7 +64,7 @@ class Twin:
     def bound(self) -> tuple[Tensor, Tensor]:
         """Cramer-Rao bounds of location (m) and magnitude (N) for marker noise alone, width known."""
         markers = Markers(self.told.s, self.positions, None, self.tension)
-        return load_bound(self.robot, markers, self.force, self.location, self.base_wrench, NOISE, True)
+        return load_bound(self.robot, markers, self.force, self.location, self.base_wrench, NOISE)
 
 
 def twin(robot: Robot, displacement: Tensor, force: Tensor, location: Tensor, mismatch: float, draws: int, seed: int) -> Twin:

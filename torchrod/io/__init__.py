@@ -1,7 +1,8 @@
-"""Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ), calibrations (JSON) and data sets (TOML, folders)."""
+"""Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ), calibrations and what markers see (JSON), data sets."""
 
 from .calibration_file import CALIBRATION_SUFFIXES, unit_of, write_calibration
 from .dataset_file import read_dataset_spec
+from .observability_file import write_observability, write_observability_table
 from .result_file import RESULT_SUFFIXES, read_fit, write_result
 from .robot_file import read_robot
 from .robot_text import write_calibrated
@@ -24,6 +25,8 @@ __all__ = [
     "write_calibrated",
     "write_calibration",
     "write_manifest",
+    "write_observability",
+    "write_observability_table",
     "write_result",
     "write_shapes",
     "write_shard",

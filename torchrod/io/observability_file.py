@@ -1,0 +1,84 @@
+"""OBSERVABILITY.json and .csv: what torchrod observability found (docs/files.md)."""
+
+import csv
+import json
+import math
+from pathlib import Path
+
+from torch import Tensor
+
+from ..errors import InputError
+from ..observability import FALSE_ALARM, LOCALIZED, POWER, Observability
+from ..placement import Placement
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no NaN and no infinity: what markers do not show is null."""
+    return value if math.isfinite(value) else None
+
+
+def _columns(seen: Observability) -> dict[str, Tensor]:
+    """One entry per place; the worst direction, and the mean over directions where the name says so."""
+    return {
+        "location_m": seen.location,
+        "detectable_N": seen.detectable.amax(-1),
+        "localizable_N": seen.localizable.amax(-1),
+        "magnitude_std_N": seen.magnitude_std.amax(-1),
+        "magnitude_std_mean_N": seen.magnitude_std.mean(-1),
+        "location_std_m": seen.location_std.amax(-1),
+        "location_std_mean_m": seen.location_std.mean(-1),
+    }
+
+
+def write_observability_table(path: str | Path, seen: Observability) -> None:
+    """One row per place as CSV; `inf` where markers do not show it, `nan` where there is no equilibrium. Errors: InputError."""
+    columns = _columns(seen)
+    try:
+        with Path(path).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
+
+
+def write_observability(
+    path: str | Path,
+    seen: Observability,
+    markers: list[float],
+    robot: str,
+    noise: float,
+    tension: list[float],
+    registration: bool,
+    placed: Placement | None,
+) -> None:
+    """The whole result as JSON. markers: m; noise: m; tension: N. Errors: InputError where the file cannot be written."""
+    columns = {name: values.tolist() for name, values in _columns(seen).items()}
+    content = {
+        "robot": robot,
+        "markers_m": markers,
+        "noise_m": noise,
+        "force_N": seen.force,
+        "tension_N": tension,
+        "registration": registration,
+        "directions": len(seen.direction),
+        "false_alarm": FALSE_ALARM,
+        "power": POWER,
+        "localized_share": LOCALIZED,
+        "places": [
+            {name: _plain(value) for name, value in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)
+        ],
+        "placement": None
+        if placed is None
+        else {
+            "from_m": placed.nearest,
+            "even_m": placed.even.tolist(),
+            "proposed_m": placed.s.tolist(),
+            "worst_location_std_even_m": _plain(placed.worst_even),
+            "worst_location_std_m": _plain(placed.worst),
+        },
+    }
+    try:
+        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
