@@ -1,71 +1,206 @@
-"""How many loads: the Bayesian information criterion over nested models, each sample deciding for itself."""
+"""How many loads, and of what kind: the Bayesian information criterion, each sample deciding for itself.
+
+Stage k fits k contacts to the samples that still need it: those that no fit so far explains, and those whose residual asks for one
+more load by the score test of torchrod.probe, from which its fit starts.
+"""
 
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .estimator import Settings, estimate
 from .measurement import Markers, Model
+from .probe import probe, start_with_one_more
 from .result import Estimate
+from .starts import Start, StartRule
 from .status import Status
+
+PROMISING = 0.4  # one more load is tried where the score test promises this much of what BIC asks for: it is linear, so only a hint
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One explanation: `contacts` loads, fitted by `model`; name is what files call it."""
+
+    name: str
+    contacts: int
+    model: Model
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The chosen fit of every sample (loads that are not there are NaN), which hypothesis it is, and the evidence for each.
+
+    bic (B, H): chi^2 + k ln(n); NaN where a hypothesis was not needed, inf where its fit did not converge. choice (B,): an index of
+    names.
+    """
+
+    fit: Estimate
+    names: tuple[str, ...]
+    choice: Int[Tensor, " B"]
+    bic: Float[Tensor, "B H"]
+
+
+def free_parameters(model: Model) -> int:
+    """Load parameters that the data alone must determine."""
+    return model.load_size - model.coordinates.informative_priors
 
 
 def bic(fit: Estimate, model: Model, markers: Markers) -> Float[Tensor, " B"]:
-    """chi^2 + k ln(n): k free load parameters (one with a prior counts too), n marker coordinates seen; inf where not converged.
+    """chi^2 + k ln(n): k load parameters that no prior holds, n marker coordinates seen; inf where not converged.
 
-    Source: Schwarz 1978, for Gaussian noise of known size.
+    Source: Schwarz 1978, for Gaussian noise of known size. A width with a prior is paid for in chi^2, which contains the prior.
     """
     n = 3.0 * markers.present.sum(-1)
-    value = fit.chi2 + model.coordinates.size * torch.log(n.clamp(min=math.e))
+    value = fit.chi2 + free_parameters(model) * torch.log(n.clamp(min=math.e))
     return torch.where((fit.status == int(Status.CONVERGED)) & torch.isfinite(value), value, torch.inf)
 
 
-def _widened(fit: Estimate, like: Estimate) -> Estimate:
-    """The fit with NaN loads added, so that it stands beside one with more loads."""
-    padded = {}
-    for field in fields(Estimate):
-        value, wide = getattr(fit, field.name), getattr(like, field.name)
-        if value is not None and value.shape != wide.shape:
-            full = torch.full_like(wide, torch.nan)
-            full[tuple(slice(0, n) for n in value.shape)] = value
-            padded[field.name] = full
-    return replace(fit, **padded)
+def _common(value: Tensor | None, other: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+    """Both with NaN entries added where the other one has more loads or unknowns, so that samples of either can stand together."""
+    if value is None and other is None:
+        return None, None
+    like = other if value is None else value
+    assert like is not None
+    shapes = [v.shape for v in (value, other) if v is not None]
+    wide = torch.Size(max(sizes) for sizes in zip(*(s[1:] for s in shapes), strict=True))
+
+    def padded(v: Tensor | None, count: int) -> Tensor:
+        if v is not None and v.shape[1:] == wide:
+            return v
+        full = torch.full((count, *wide), torch.nan, dtype=like.dtype)
+        if v is not None:
+            full[(slice(None), *(slice(0, n) for n in v.shape[1:]))] = v
+        return full
+
+    counts = [0 if v is None else len(v) for v in (value, other)]
+    return padded(value, counts[0]), padded(other, counts[1])
 
 
-def select_count(
-    models: list[Model],
+def _replaced(fit: Estimate, other: Estimate, index: Int[Tensor, " b"], better: Bool[Tensor, " b"]) -> Estimate:
+    """`fit` with the samples of `index` that are better in `other`, which holds only those samples; every evaluation is counted."""
+    B, b = len(fit.status), len(index)
+    changed = {}
+    for f in fields(Estimate):
+        mine, theirs = getattr(fit, f.name), getattr(other, f.name)
+        if mine is None and theirs is not None:
+            mine = torch.full((B, *theirs.shape[1:]), torch.nan, dtype=theirs.dtype)
+        if theirs is None and mine is not None:
+            theirs = torch.full((b, *mine.shape[1:]), torch.nan, dtype=mine.dtype)
+        wide, part = _common(mine, theirs)
+        if wide is not None and part is not None:
+            wide = wide.clone()
+            wide[index[better]] = part[better]
+        changed[f.name] = wide
+    changed["iterations"] = fit.iterations.index_add(0, index, other.iterations)
+    changed["restarts"] = fit.restarts.index_add(0, index, other.restarts)
+    return replace(fit, **changed)
+
+
+def select(
+    hypotheses: list[Hypothesis],
     markers: Markers,
     noise: float,
     settings: Settings,
+    start: Callable[[Model], StartRule],
     bar: Callable[[int, str], AbstractContextManager[Any]],
-) -> Estimate:
-    """Fit 0, 1, 2, ... loads (one model each) and keep, per sample, the count of least BIC; loads that are not there are NaN.
+) -> Selection:
+    """Fit the hypotheses stage by stage, the fewest contacts first, and keep, per sample, the one of least BIC.
 
-    A sample for which no count converges is reported with the count that left the smallest chi^2.
+    start: the rule a model starts by where the residual of an earlier fit suggests nothing. A sample for which nothing converges is
+    reported with the fit that left the smallest chi^2. Errors: ValueError where there are too few markers for the first hypothesis.
     """
-    fits = []
-    for model in models:
-        if 3 * len(markers.s) < model.size - 6:
-            break
-        with bar(len(markers.positions), f"count {len(fits)}") as b:
-            fits.append(estimate(model, markers, noise, settings, progress=b.update))
-    if not fits:
-        raise ValueError(f"{len(markers.s)} markers are too few; add markers")
-    scores = torch.stack([bic(f, m, markers) for f, m in zip(fits, models, strict=False)])
-    misfit = torch.stack([f.chi2.nan_to_num(torch.inf) for f in fits])
-    scores = torch.where(torch.isinf(scores).all(0), misfit, scores)
-    choice = scores.argmin(0)
-    wide = [_widened(f, fits[-1]) for f in fits]
-    chosen = {}
-    for field in fields(Estimate):
-        values = [getattr(f, field.name) for f in wide]
-        if values[0] is not None:
-            stack = torch.stack(values)
-            chosen[field.name] = stack[choice, torch.arange(stack.shape[1])]
-    return replace(wide[-1], **chosen)
+    B = len(markers.positions)
+    hasty = replace(settings, restarts=())  # a count that is too low fails however it starts
+    fit: Estimate | None = None
+    scores = torch.full((B, len(hypotheses)), torch.nan, dtype=torch.float64)
+    best, choice = torch.full((B,), torch.inf, dtype=torch.float64), torch.zeros(B, dtype=torch.int64)
+    fits: dict[str, tuple[Estimate, Int[Tensor, " b"]]] = {}
+    for h, hypothesis in enumerate(hypotheses):
+        model = hypothesis.model
+        if fit is not None and 3 * len(markers.s) < model.size - 6:
+            continue
+        index, begin = _needed(hypothesis, hypotheses, fits, fit, markers, noise, start(model))
+        if not len(index):
+            continue
+        part = markers.take(index)
+        with bar(len(index), hypothesis.name) as b:
+            other = estimate(model, part, noise, hasty, begin, b.update)
+        fits[hypothesis.name] = other, index
+        scores[index, h] = bic(other, model, part)
+        if fit is None:
+            fit, best, choice = other, scores[:, h].clone(), choice + h
+            continue
+        lower = _explains_better(scores[index, h], best[index], other, fit, index)
+        fit = _replaced(fit, other, index, lower)
+        best[index[lower]], choice[index[lower]] = scores[index[lower], h], h
+    assert fit is not None
+    for h, hypothesis in enumerate(hypotheses):
+        index = ((choice == h) & ~fit.accepted & torch.isfinite(fit.x[:, -1])).nonzero().squeeze(-1)
+        if len(index) and settings.restarts:
+            part = markers.take(index)
+            other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
+            fit = _replaced(fit, other, index, other.accepted)
+            scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
+    return Selection(fit, tuple(h.name for h in hypotheses), choice, scores)
+
+
+def _explains_better(
+    score: Float[Tensor, " b"], best: Float[Tensor, " b"], other: Estimate, fit: Estimate, index: Int[Tensor, " b"]
+) -> Bool[Tensor, " b"]:
+    """By BIC; where neither converged, by chi^2."""
+    neither = torch.isinf(score) & torch.isinf(best)
+    return torch.where(neither, other.chi2 < fit.chi2[index].nan_to_num(torch.inf), score < best)
+
+
+def _needed(
+    hypothesis: Hypothesis,
+    hypotheses: list[Hypothesis],
+    fits: dict[str, tuple[Estimate, Int[Tensor, " b"]]],
+    fit: Estimate | None,
+    markers: Markers,
+    noise: float,
+    rule: StartRule,
+) -> tuple[Int[Tensor, " b"], StartRule]:
+    """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any."""
+    everyone = torch.arange(len(markers.positions))
+    before = [h for h in hypotheses if h.contacts == hypothesis.contacts - 1 and _same_kind(h.model, hypothesis.model)]
+    if not before or before[0].name not in fits:
+        return (everyone if hypothesis.contacts == 0 or fit is None else everyone[:0]), rule
+    fitted, index = fits[before[0].name]
+    model = before[0].model
+    sound = torch.isfinite(fitted.x).all(-1)
+    found = probe(model, fitted.x.nan_to_num(0.0), markers.take(index), noise)
+    per_load = free_parameters(hypothesis.model) - free_parameters(model)
+    asked = per_load * torch.log((3.0 * markers.present[index].sum(-1)).clamp(min=math.e))
+    wanted = sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)
+    rows = wanted.nonzero().squeeze(-1)
+    begin = start_with_one_more(
+        hypothesis.model, replace(found, **{f: getattr(found, f)[rows] for f in ("drop", "force", "eta", "x")})
+    )
+    return index[rows], _from(begin) if hypothesis.contacts > 1 else rule
+
+
+def _same_kind(a: Model, b: Model) -> bool:
+    """Whether two models differ in the number of loads only; a model without loads has no width prior to differ in."""
+    alike = getattr(a.coordinates, "prior_name", "") == getattr(b.coordinates, "prior_name", "") or not a.coordinates.size
+    return a.tip == b.tip and alike
+
+
+def _from(begin: Start) -> StartRule:
+    """The rule that hands out `begin`, chunk after chunk."""
+    taken = 0
+
+    def rule(model: Model, markers: Markers, noise: float) -> Start:
+        nonlocal taken
+        rows = slice(taken, taken + len(markers.positions))
+        taken = rows.stop
+        return Start(begin.x[rows], None, begin.warm[rows])
+
+    return rule

@@ -64,7 +64,7 @@ def shape_innovation(study: Study, paper: bool, iterations: int) -> dict[str, li
     w, one, prior = model.weights(markers, 1e-3), torch.ones(model.size, dtype=torch.float64), model.prior()
     residuals: dict[str, list[float | None]] = {}
     for name, sign in (("z - h", 1.0), ("h - z", -1.0)):
-        x, Sigma = cold_start(model, markers), torch.diag(settings.Sigma0 * one).unsqueeze(0)
+        x, Sigma = cold_start(model, markers, 1e-3).x, torch.diag(settings.Sigma0 * one).unsqueeze(0)
         residuals[name] = []
         for _ in range(iterations):
             at = linearize(model, x, markers, w)
@@ -98,7 +98,7 @@ def damping(study: Study, powers: tuple[float, ...], count: int) -> dict[str, di
     """Per Q, over `count` cases: the mean first step from one start with Sigma_0 = 0, and the mean iterations (at most 200)."""
     model = Model(study.robot, GaussianCoordinates(1, L, study.robot.rod.force_scale))
     markers = study.noisy(0.0, 1).take(torch.arange(count))
-    x = cold_start(model, markers)
+    x = cold_start(model, markers, 1e-3).x
     at = linearize(model, x, markers, model.weights(markers, 1e-3))
     rows = {}
     for Q in powers:
