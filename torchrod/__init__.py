@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .statics import Equilibrium, Shape, shape_from_base, solve_shape
     from .status import Status
     from .tendons import Tendon, Tendons
+    from .warmstart import WarmStart, find_warm_start
 
 _HOMES = {
     "actuation": ("Actuated", "reference_lengths", "solve_displacement"),
@@ -54,6 +55,7 @@ _HOMES = {
     "statics": ("Equilibrium", "Shape", "shape_from_base", "solve_shape"),
     "status": ("Status",),
     "tendons": ("Tendon", "Tendons"),
+    "warmstart": ("WarmStart", "find_warm_start"),
 }
 __all__ = [
     "Actuated",
@@ -83,10 +85,12 @@ __all__ = [
     "Status",
     "Tendon",
     "Tendons",
+    "WarmStart",
     "cold_start",
     "draw",
     "draw_on",
     "estimate",
+    "find_warm_start",
     "forward_jacobian",
     "paper_settings",
     "read_dataset",

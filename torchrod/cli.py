@@ -36,7 +36,7 @@ def _estimate_parser() -> ArgumentParser:
         help="what is known of the width",
     )
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
-    parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits (none yet), or off")
+    parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")

@@ -3,6 +3,7 @@
 import math
 import re
 import warnings
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -34,8 +35,10 @@ from .result import Estimate
 from .robot import Robot
 from .rod import DTYPE
 from .selection import select_count
+from .starts import StartRule, cold_start
 from .statics import solve_shape
 from .status import Status
+from .warmstart import WarmStart, find_warm_start
 
 MAX_CONTACTS = 3
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
@@ -83,8 +86,6 @@ def estimate(options: Namespace) -> None:
     shapes = read_shapes(options.shapes, robot)
     if not 1e-9 <= options.noise <= 1:
         raise InputError(f"--noise is {options.noise}; it must be a standard deviation in metres, from 1e-9 to 1")
-    if options.warm_start not in ("auto", "off"):
-        raise InputError(f"--warm-start {options.warm_start}: this version reads no checkpoints; use auto or off")
     _positive("--steps", options.steps)
     _positive("--max-iterations", options.max_iterations)
     _writable(options.out, RESULT_SUFFIXES)
@@ -97,12 +98,14 @@ def estimate(options: Namespace) -> None:
         return Model(robot, coordinates, options.registration, steps=options.steps)
 
     settings = Settings(max_iterations=options.max_iterations)
+    models = [model(k) for k in (range(MAX_CONTACTS + 1) if count is None else [count])]
+    start_of = _starts(options, models, shapes.markers)
     try:
         if count is None:
-            result = select_count([model(k) for k in range(MAX_CONTACTS + 1)], shapes.markers, options.noise, settings, _bar)
+            result = select_count(models, shapes.markers, options.noise, settings, _bar, start_of)
         else:
             with _bar(len(shapes.samples), f"{count} contact{'s' * (count != 1)}") as bar:
-                result = run_estimate(model(count), shapes.markers, options.noise, settings, progress=bar.update)
+                result = run_estimate(models[0], shapes.markers, options.noise, settings, start_of(models[0]), bar.update)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     print(_report(result, shapes.samples))  # noqa: T201
@@ -110,6 +113,24 @@ def estimate(options: Namespace) -> None:
         write_result(options.out, result, shapes.samples, robot.name)
     if options.plot:
         _draw(options.plot, robot, shapes.markers, result, shapes.samples)
+
+
+def _starts(options: Namespace, models: list[Model], markers: Markers) -> Callable[[Model], StartRule]:
+    """Where the fits of each model start: cold, from the shipped checkpoint that fits, or from the one that is named."""
+    if options.warm_start == "off":
+        return lambda _: cold_start
+    if options.warm_start == "auto":
+        return lambda model: find_warm_start(model) or cold_start
+    named = WarmStart.read(options.warm_start)
+    reasons = [named.misfit(model, markers, options.noise) for model in models]
+    if None not in reasons:
+        nearest = min(range(len(models)), key=lambda k: abs(models[k].coordinates.size - 4 * named.card["contacts"]))
+        raise InputError(f"--warm-start {options.warm_start}: {reasons[nearest]}")
+    read = named.read_markers(models[reasons.index(None)], markers, options.noise)
+    outside = int((~named.known(markers, read)).sum())
+    if outside:
+        warnings.warn(f"{options.warm_start}: {outside} samples lie outside of what it knows and start cold", stacklevel=2)
+    return lambda model: named if named.misfit(model) is None else cold_start
 
 
 def _bar(total: int, what: str) -> tqdm:

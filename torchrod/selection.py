@@ -13,6 +13,7 @@ from torch import Tensor
 from .estimator import Settings, estimate
 from .measurement import Markers, Model
 from .result import Estimate
+from .starts import StartRule, cold_start
 from .status import Status
 
 
@@ -44,17 +45,19 @@ def select_count(
     noise: float,
     settings: Settings,
     bar: Callable[[int, str], AbstractContextManager[Any]],
+    start_of: Callable[[Model], StartRule] = lambda _: cold_start,
 ) -> Estimate:
     """Fit 0, 1, 2, ... loads (one model each) and keep, per sample, the count of least BIC; loads that are not there are NaN.
 
-    A sample for which no count converges is reported with the count that left the smallest chi^2.
+    start_of: where the fits of a model start. A sample for which no count converges is reported with the count that left the
+    smallest chi^2.
     """
     fits = []
     for model in models:
         if 3 * len(markers.s) < model.size - 6:
             break
         with bar(len(markers.positions), f"count {len(fits)}") as b:
-            fits.append(estimate(model, markers, noise, settings, progress=b.update))
+            fits.append(estimate(model, markers, noise, settings, start_of(model), b.update))
     if not fits:
         raise ValueError(f"{len(markers.s)} markers are too few; add markers")
     scores = torch.stack([bic(f, m, markers) for f, m in zip(fits, models, strict=False)])
