@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .statics import Equilibrium, Shape, shape_from_base, solve_shape
     from .status import Status
     from .tendons import Tendon, Tendons
+    from .warmstart import WarmStart, find_warm_start
 
 _HOMES = {
     "actuation": ("Actuated", "reference_lengths", "solve_displacement"),
@@ -60,6 +61,7 @@ _HOMES = {
     "statics": ("Equilibrium", "Shape", "shape_from_base", "solve_shape"),
     "status": ("Status",),
     "tendons": ("Tendon", "Tendons"),
+    "warmstart": ("WarmStart", "find_warm_start"),
 }
 __all__ = [
     "Actuated",
@@ -92,12 +94,14 @@ __all__ = [
     "Status",
     "Tendon",
     "Tendons",
+    "WarmStart",
     "bounds",
     "calibrate",
     "cold_start",
     "draw",
     "draw_on",
     "estimate",
+    "find_warm_start",
     "forward_jacobian",
     "load_bound",
     "paper_settings",

@@ -31,12 +31,12 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument(
         "--load-prior",
         type=str,
-        choices=["point", "contact", "distributed", "none"],
+        choices=["point", "contact", "distributed", "none", "auto"],
         default="contact",
-        help="what is known of the width",
+        help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
-    parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits (none yet), or off")
+    parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
     parser.add_argument(
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Callable
 
 import torch
 from jsonargparse import Namespace
@@ -13,6 +14,7 @@ from .coordinates import GaussianCoordinates
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
+from .features import features
 from .io import (
     RESULT_SUFFIXES,
     read_fit,
@@ -24,9 +26,11 @@ from .measurement import Markers, Model
 from .observability_command import observability
 from .result import Estimate
 from .robot import Robot
-from .selection import select_count
+from .selection import Hypothesis, select
 from .simulate_command import simulate, simulate_dataset
+from .starts import StartRule, cold_start
 from .status import Status
+from .warmstart import WarmStart, find_warm_start
 
 __all__ = ["calibrate", "estimate", "observability", "plot", "simulate", "simulate_dataset"]
 
@@ -58,8 +62,6 @@ def estimate(options: Namespace) -> None:
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot)
     noise_std(options.noise)
-    if options.warm_start not in ("auto", "off"):
-        raise InputError(f"--warm-start {options.warm_start}: this version reads no checkpoints; use auto or off")
     positive("--steps", options.steps)
     positive("--max-iterations", options.max_iterations)
     writable(options.out, RESULT_SUFFIXES)
@@ -67,24 +69,60 @@ def estimate(options: Namespace) -> None:
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
-    def model(k: int) -> Model:
-        coordinates = GaussianCoordinates(k, rod.length, rod.force_scale, options.load_prior, locations)
-        return Model(robot, coordinates, options.registration, steps=options.steps, tip=options.unknown_tip)
+    def model(k: int, prior: str, tip: str) -> Model:
+        coordinates = GaussianCoordinates(k, rod.length, rod.force_scale, prior, locations)
+        return Model(robot, coordinates, options.registration, steps=options.steps, tip=tip)
 
     settings = Settings(max_iterations=options.max_iterations)
+    candidates = _hypotheses(options, count, model)
+    start_of, evidence = _starts(options, [c.model for c in candidates], shapes.markers), None
     try:
-        if count is None:
-            result = select_count([model(k) for k in range(MAX_CONTACTS + 1)], shapes.markers, options.noise, settings, _bar)
+        if len(candidates) > 1:
+            result, evidence = select(candidates, shapes.markers, options.noise, settings, start_of, _bar)
         else:
+            only = candidates[0].model
             with _bar(len(shapes.samples), f"{count} contact{'s' * (count != 1)}") as bar:
-                result = run_estimate(model(count), shapes.markers, options.noise, settings, progress=bar.update)
+                result = run_estimate(only, shapes.markers, options.noise, settings, start_of(only), bar.update)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     print(_report(result, shapes.samples))  # noqa: T201
     if options.out:
-        write_result(options.out, result, shapes.samples, robot.name)
+        write_result(options.out, result, shapes.samples, robot.name, evidence)
     if options.plot:
         _draw(options.plot, robot, shapes.markers, result, shapes.samples)
+
+
+def _hypotheses(options: Namespace, count: int | None, model: Callable[[int, str, str], Model]) -> list[Hypothesis]:
+    """What competes: numbers of contacts, widths and the unknown tip, where they are left to the data."""
+    counts = range(MAX_CONTACTS + 1) if count is None else [count]
+    priors = ["contact", "distributed"] if options.load_prior == "auto" else [options.load_prior]
+    tips = ["none", options.unknown_tip] if count is None and options.unknown_tip != "none" else [options.unknown_tip]
+    found = []
+    for k in counts:
+        for tip in tips:
+            for prior in priors if k else priors[:1]:
+                name = f"{k} {prior}" if len(priors) > 1 and k else str(k)
+                name += f" + tip {tip}" if len(tips) > 1 and tip != "none" else ""
+                found.append(Hypothesis(name, k, model(k, prior, tip)))
+    return found
+
+
+def _starts(options: Namespace, models: list[Model], markers: Markers) -> Callable[[Model], StartRule]:
+    """Where the fits of each model start: cold, from the shipped checkpoint that fits, or from the one that is named."""
+    if options.warm_start == "off":
+        return lambda _: cold_start
+    if options.warm_start == "auto":
+        return lambda model: find_warm_start(model) or cold_start
+    named = WarmStart.read(options.warm_start)
+    reasons = [named.misfit(model, markers, options.noise) for model in models]
+    if None not in reasons:
+        nearest = min(range(len(models)), key=lambda k: abs(models[k].coordinates.size - 4 * named.card["contacts"]))
+        raise InputError(f"--warm-start {options.warm_start}: {reasons[nearest]}")
+    read = features(models[reasons.index(None)], markers, options.noise)
+    outside = int((~named.known(markers, read)).sum())
+    if outside:
+        warnings.warn(f"{options.warm_start}: {outside} samples lie outside of what it knows and start cold", stacklevel=2)
+    return lambda model: named if named.misfit(model) is None else cold_start
 
 
 def _bar(total: int, what: str) -> tqdm:

@@ -160,6 +160,18 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What speaks for each hypothesis: names (H); bic (B, H), chi^2 + k ln(n), of which the least is chosen; choice (B,), an index.
+
+    NaN where a hypothesis was not needed, inf where its fit did not converge.
+    """
+
+    names: tuple[str, ...]
+    choice: Int[Tensor, " B"]
+    bic: Float[Tensor, "B H"]
+
+
+@dataclass(frozen=True)
 class Fit:
     """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
     wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, and the unknown

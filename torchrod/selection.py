@@ -17,7 +17,7 @@ from torch import Tensor
 from .estimator import Settings, estimate
 from .measurement import Markers, Model
 from .probe import probe, start_with_one_more
-from .result import Estimate
+from .result import Estimate, Evidence
 from .starts import Start, StartRule
 from .status import Status
 
@@ -31,20 +31,6 @@ class Hypothesis:
     name: str
     contacts: int
     model: Model
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The chosen fit of every sample (loads that are not there are NaN), which hypothesis it is, and the evidence for each.
-
-    bic (B, H): chi^2 + k ln(n); NaN where a hypothesis was not needed, inf where its fit did not converge. choice (B,): an index of
-    names.
-    """
-
-    fit: Estimate
-    names: tuple[str, ...]
-    choice: Int[Tensor, " B"]
-    bic: Float[Tensor, "B H"]
 
 
 def free_parameters(model: Model) -> int:
@@ -110,8 +96,10 @@ def select(
     settings: Settings,
     start: Callable[[Model], StartRule],
     bar: Callable[[int, str], AbstractContextManager[Any]],
-) -> Selection:
+) -> tuple[Estimate, Evidence]:
     """Fit the hypotheses stage by stage, the fewest contacts first, and keep, per sample, the one of least BIC.
+
+    Loads that the chosen hypothesis does not have are NaN.
 
     start: the rule a model starts by where the residual of an earlier fit suggests nothing. A sample for which nothing converges is
     reported with the fit that left the smallest chi^2. Errors: ValueError where there are too few markers for the first hypothesis.
@@ -126,7 +114,7 @@ def select(
         model = hypothesis.model
         if fit is not None and 3 * len(markers.s) < model.size - 6:
             continue
-        index, begin = _needed(hypothesis, hypotheses, fits, fit, markers, noise, start(model))
+        index, begin = _needed(hypothesis, hypotheses, fits, markers, noise, start(model))
         if not len(index):
             continue
         part = markers.take(index)
@@ -148,7 +136,7 @@ def select(
             other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
             fit = _replaced(fit, other, index, other.accepted)
             scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
-    return Selection(fit, tuple(h.name for h in hypotheses), choice, scores)
+    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores)
 
 
 def _explains_better(
@@ -163,7 +151,6 @@ def _needed(
     hypothesis: Hypothesis,
     hypotheses: list[Hypothesis],
     fits: dict[str, tuple[Estimate, Int[Tensor, " b"]]],
-    fit: Estimate | None,
     markers: Markers,
     noise: float,
     rule: StartRule,
@@ -171,8 +158,10 @@ def _needed(
     """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any."""
     everyone = torch.arange(len(markers.positions))
     before = [h for h in hypotheses if h.contacts == hypothesis.contacts - 1 and _same_kind(h.model, hypothesis.model)]
-    if not before or before[0].name not in fits:
-        return (everyone if hypothesis.contacts == 0 or fit is None else everyone[:0]), rule
+    if not before:
+        return everyone, rule
+    if before[0].name not in fits:
+        return everyone[:0], rule
     fitted, index = fits[before[0].name]
     model = before[0].model
     sound = torch.isfinite(fitted.x).all(-1)
@@ -181,9 +170,7 @@ def _needed(
     asked = per_load * torch.log((3.0 * markers.present[index].sum(-1)).clamp(min=math.e))
     wanted = sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)
     rows = wanted.nonzero().squeeze(-1)
-    begin = start_with_one_more(
-        hypothesis.model, replace(found, **{f: getattr(found, f)[rows] for f in ("drop", "force", "eta", "x")})
-    )
+    begin = start_with_one_more(hypothesis.model, found.take(rows))
     return index[rows], _from(begin) if hypothesis.contacts > 1 else rule
 
 

@@ -13,6 +13,7 @@ from torchrod import (
     PointForces,
     Robot,
     Rod,
+    Settings,
     Tendon,
     Tendons,
     estimate,
@@ -56,10 +57,13 @@ class Twin:
     told: Markers
 
     def estimate(self) -> Estimate:
-        """One contact, gravity and tensions known, registration perfect."""
+        """One contact, gravity and tensions known, registration perfect.
+
+        Many fits of a wrong model are not accepted; starting them again from other magnitudes would not make the model right.
+        """
         rod = self.robot.rod
         model = Model(self.robot, GaussianCoordinates(1, rod.length, rod.force_scale, "contact"))
-        return estimate(model, self.told, NOISE)
+        return estimate(model, self.told, NOISE, Settings(restarts=()))
 
     def bound(self) -> tuple[Tensor, Tensor]:
         """Cramer-Rao bounds of location (m) and magnitude (N) for marker noise alone, width known."""

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError
-from ..result import Estimate, Fit
+from ..result import Estimate, Evidence, Fit
 from ..status import Status
 
 RESULT_SUFFIXES = (".json", ".npz")
@@ -74,16 +74,29 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     return record
 
 
-def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot: str) -> None:
-    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix."""
+def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
+    bic = {name: _plain(value) for name, value in zip(evidence.names, evidence.bic[b].tolist(), strict=True)}
+    return {"chosen": evidence.names[int(evidence.choice[b])], "bic": bic}
+
+
+def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot: str, evidence: Evidence | None = None) -> None:
+    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix.
+
+    evidence: for each number of loads, where it was chosen from the data.
+    """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
         raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
     if path.suffix == ".json":
-        content = {"robot": robot, "results": [result_record(estimate, b, name) for b, name in enumerate(samples)]}
+        records = [result_record(estimate, b, name) for b, name in enumerate(samples)]
+        for b, record in enumerate(records if evidence is not None else ()):
+            record["evidence"] = _evidence(evidence, b)  # pyright: ignore[reportArgumentType]
+        content = {"robot": robot, "results": records}
         path.write_text(json.dumps(content, indent=1), encoding="utf-8")
         return
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
+    if evidence is not None:
+        arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic}
     np.savez_compressed(
         path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}
     )

@@ -1,0 +1,140 @@
+"""The network of a learned start, and its file: safetensors weights beside a JSON card.
+
+Per load, from the features of torchrod.features, in the canonical frame:
+
+(1)  F = amp o_F / (2 S(eta)^1.5),    eta = o_eta,    log c = prior mean + o_c
+
+     A force F at mu L bends the rod to an rms curvature in proportion to F mu^1.5, which (1) takes out of what has to be learned.
+
+(2)  The error of (1) is taken as normal: U^T D^-1 (gamma - gamma_true) ~ N(0, I), D = diag(F's factor in (1) twice, 1, 1) per load,
+     U lower triangular with a positive diagonal, from a second head that does not reach back into the first.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from .errors import InputError
+
+SCHEMA = 1  # of the card
+PER_LOAD = 4
+ETA_LARGEST = 6.0
+INPUT_LARGEST = 8.0  # standard deviations: beyond them the network has seen nothing
+LOG_DIAGONAL = 6.0
+SPREAD_WIDTH = 64
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """gamma (B, 4 K) in the canonical frame; D (B, 4 K) and U (B, 4 K, 4 K) of (2)."""
+
+    gamma: Float[Tensor, "B n"]
+    D: Float[Tensor, "B n"]
+    U: Float[Tensor, "B n n"]
+
+    def whitened(self, error: Float[Tensor, "B n"]) -> Float[Tensor, "B n"]:
+        """U^T D^-1 error."""
+        return ((error / self.D).unsqueeze(-2) @ self.U).squeeze(-2)
+
+    @property
+    def covariance(self) -> Float[Tensor, "B n n"]:
+        """D U^-T U^-1 D."""
+        eye = torch.eye(self.U.shape[-1], dtype=self.U.dtype).expand_as(self.U)
+        root = self.D.unsqueeze(-1) * torch.linalg.solve_triangular(self.U.mT, eye, upper=True)
+        return root @ root.mT
+
+
+class Network(torch.nn.Module):
+    """An MLP with GELU, from features (B, inputs) to a Prediction for `count` loads."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, inputs: int, count: int, width: int, depth: int):
+        super().__init__()
+        self.inputs, self.count, self.width, self.depth = inputs, count, width, depth
+        n = PER_LOAD * count
+        self.register_buffer("mean", torch.zeros(inputs))
+        self.register_buffer("std", torch.ones(inputs))
+        sizes = [inputs] + [width] * depth
+        layers = [m for i in range(depth) for m in (torch.nn.Linear(sizes[i], sizes[i + 1]), torch.nn.GELU())]
+        self.body = torch.nn.Sequential(*layers)
+        self.head = torch.nn.Linear(width, n)
+        spread = torch.nn.Linear(SPREAD_WIDTH, n * (n + 1) // 2)
+        self.spread = torch.nn.Sequential(torch.nn.Linear(width, SPREAD_WIDTH), torch.nn.GELU(), spread)
+        with torch.no_grad():  # begin evenly spread along the rod, with hardly any force
+            places = torch.logit((torch.arange(count) + 1.0) / (count + 1))
+            self.head.weight.mul_(0.1)
+            self.head.bias.copy_(torch.nn.functional.pad(places.unsqueeze(-1), (2, 1)).flatten())
+
+    def forward(self, x: Float[Tensor, "B i"], amp: Float[Tensor, " B"], log_c: Float[Tensor, " B"]) -> Prediction:
+        """amp (B,) as in Features, log_c (B,) the prior mean of log(c L^2)."""
+        z = self.body(((x - self.mean) / self.std).clamp(-INPUT_LARGEST, INPUT_LARGEST))
+        o = self.head(z).unflatten(-1, (self.count, PER_LOAD))
+        eta = o[..., 2:3].clamp(-ETA_LARGEST, ETA_LARGEST)
+        unit = 0.5 * amp[:, None, None] / torch.sigmoid(eta) ** 1.5
+        gamma = torch.cat([unit * o[..., :2], eta, o[..., 3:] + log_c[:, None, None]], -1).flatten(1)
+        one = torch.ones_like(eta)
+        D = torch.cat([unit, unit, one, one], -1).flatten(1).detach()
+        n = gamma.shape[-1]
+        rows, columns = torch.tril_indices(n, n)
+        U = o.new_zeros(len(x), n, n)
+        U[:, rows, columns] = self.spread(z.detach())
+        diagonal = U.diagonal(dim1=-2, dim2=-1).clamp(-LOG_DIAGONAL, LOG_DIAGONAL).exp()
+        return Prediction(gamma, D, U.tril(-1) + torch.diag_embed(diagonal))
+
+
+def turn_of_gamma(turn: Float[Tensor, "B 2 2"], count: int) -> Float[Tensor, "B n n"]:
+    """The orthogonal matrix that takes gamma of `count` loads from the section frame to the canonical one: F turns."""
+    out = torch.eye(PER_LOAD * count, dtype=turn.dtype).repeat(len(turn), 1, 1)
+    for first in range(0, PER_LOAD * count, PER_LOAD):
+        out[:, first : first + 2, first : first + 2] = turn
+    return out
+
+
+def digest(path: Path) -> str:
+    """sha256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def save_checkpoint(path: Path, network: Network, card: dict[str, Any]) -> None:
+    """Write NAME.safetensors and NAME.json; the card gains the network's sizes and the weights' sha256."""
+    state = {name: value.detach().cpu().float().contiguous() for name, value in network.state_dict().items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_file(state, path)
+    sizes = {key: getattr(network, key) for key in ("inputs", "count", "width", "depth")}
+    full = {"schema": SCHEMA, "name": path.stem, **card, "network": sizes, "sha256": digest(path)}
+    path.with_suffix(".json").write_text(json.dumps(full, indent=1) + "\n", encoding="utf-8")
+
+
+def load_checkpoint(path: Path) -> tuple[Network, dict[str, Any]]:
+    """The network, in float64 for evaluation, and its card. Errors: InputError in one sentence for what is damaged or foreign.
+
+    The weights are float32 numbers; evaluated in float64, a sample's answer does not depend on how the batch was blocked.
+    """
+    for file in (path, path.with_suffix(".json")):
+        if not file.is_file():
+            raise InputError(f"{file}: no such file; a checkpoint is NAME.safetensors with NAME.json beside it")
+    try:
+        card = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        if card["schema"] != SCHEMA:
+            raise InputError(f"{path}: its card has schema {card['schema']}, this version reads {SCHEMA}; train it again")
+        if card["sha256"] != digest(path):
+            raise InputError(f"{path}: is not the file that its card describes; fetch or train it again")
+        sizes = {key: int(card["network"][key]) for key in ("inputs", "count", "width", "depth")}
+        network = Network(**sizes)
+        network.load_state_dict(load_file(path))
+    except InputError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError, SafetensorError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: is not a checkpoint of torchrod ({reason}); train one with training.train") from None
+    return network.double().eval().requires_grad_(False), card

@@ -1,0 +1,221 @@
+"""Training cases: random robots, loads and markers, and the answer that the filter itself gives when it starts at the truth.
+
+A block has one robot, one marker layout and one noise level, and is a pure function of (recipe, index).
+"""
+
+import math
+from dataclasses import asdict, dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchrod import (
+    DatasetSpec,
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PolynomialLoads,
+    Robot,
+    Rod,
+    Settings,
+    Start,
+    Tendon,
+    Tendons,
+    cold_start,
+    estimate,
+    simulate_shard,
+    solve_shape,
+)
+from torchrod.estimator import CHUNK, linearize
+from torchrod.features import features, prior_log_c
+from torchrod.network import PER_LOAD, turn_of_gamma
+from torchrod.starts import equilibrium_wrench
+
+L, DIAMETER, E, G = 0.4, 0.0014, 207e9, 79e9  # of the rod; the features are dimensionless, so one rod stands for all
+LEAST_SEEN = 8
+TENDON_SHARE = 0.09  # of the rod's own stiffness: below it the strain balance needs few steps
+FARTHEST_LOAD = 0.998  # eta is finite there
+COLUMNS = ("x", "amp", "log_c", "target", "M", "seen")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a network learns from. Lengths in L, forces and weights in force scales (4 EI / L^2).
+
+    load: "contacts" (point forces) or "smooth" (cubic in s). priors: taken in turn by the blocks. force: log-uniform; of a smooth
+    load its largest density times L. tendons: how many, at least and at most; weight: the largest. target_iterations: of the filter
+    from the truth.
+    """
+
+    contacts: int
+    load: str
+    priors: tuple[str, ...]
+    force: tuple[float, float]
+    tendons: tuple[int, int] = (0, 0)
+    weight: float = 0.0
+    noise: tuple[float, float] = (2e-4, 6e-3)
+    markers: tuple[int, ...] = (20, 12, 20, 30, 40)
+    location: tuple[float, float] = (0.04, 1.0)
+    min_gap: float = 0.05
+    blocks: int = 40
+    block_size: int = 512
+    target_iterations: int = 3
+    seed: int = 0
+
+    def record(self) -> dict[str, object]:
+        """Plain values for JSON."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """The robot of a block, its markers without a gap, and a truth gamma (B, 4 K) to start from; N, m."""
+
+    robot: Robot
+    markers: Markers
+    gamma: Float[Tensor, "B n"]
+
+
+def generator_of(recipe: Recipe, index: int) -> torch.Generator:
+    """The random stream of a block."""
+    return torch.Generator().manual_seed(recipe.seed * 1_000_003 + index)
+
+
+def noise_of(recipe: Recipe, index: int) -> float:
+    """Log-uniform over the blocks, by the golden ratio's low-discrepancy sequence (over L)."""
+    low, high = recipe.noise
+    return low * (high / low) ** ((index * 0.6180339887) % 1.0)
+
+
+def layout(recipe: Recipe, index: int, generator: torch.Generator) -> Float[Tensor, " P"]:
+    """Arc lengths of the markers over L: even up to the tip, in every other block uneven and not quite up to it."""
+    count = recipe.markers[index % len(recipe.markers)]
+    s = (torch.arange(count) + 1.0) / count
+    if (index // len(recipe.markers)) % 2:
+        s = (s - 0.9 / count * torch.rand(count, generator=generator)) * (0.9 + 0.1 * torch.rand(1, generator=generator))
+    return s
+
+
+def random_robot(recipe: Recipe, generator: torch.Generator) -> tuple[Robot, float]:
+    """A robot and its largest tension (N), so small that sum tau r^2 stays below TENDON_SHARE of the rod's torsional stiffness."""
+    plain = Rod.circular(L, DIAMETER, E, G)
+    u = torch.rand(16, generator=generator).tolist()
+    count = recipe.tendons[0] + int(u[0] * (recipe.tendons[1] - recipe.tendons[0] + 1))
+    tendons, top = [], 6 * plain.force_scale
+    for k in range(count):
+        r, angle, end = L * 0.01 * 6 ** u[1 + k], 2 * math.pi * u[4 + k], L * min(0.4 + 0.9 * u[7 + k], 1.0)
+        tendons.append(Tendon.straight(r * math.cos(angle), r * math.sin(angle), end))
+        top = min(top, 0.7 * plain.bending_stiffness / (L * r))
+    if tendons:
+        reach = max(x * x + y * y for t in tendons for _, x, y in t.routing)
+        softness = 1 / float(plain.K_se.diagonal().min()) + reach / float(plain.K_bt.diagonal().min())
+        top = min(top, TENDON_SHARE / (count * softness))
+    direction = torch.randn(3, generator=generator)
+    weight = recipe.weight * u[10] * plain.force_scale / L * direction / direction.norm()
+    return Robot(Rod.circular(L, DIAMETER, E, G, 1.0), Tendons(tuple(tendons)), weight, "training"), top
+
+
+def contacts(recipe: Recipe, index: int, prior: str) -> Draw:
+    """Point forces, through the library's data sets."""
+    generator = generator_of(recipe, index)
+    robot, top = random_robot(recipe, generator)
+    s = layout(recipe, index, generator)
+    spec = DatasetSpec(
+        robots=(robot,),
+        samples=recipe.block_size,
+        shard_size=recipe.block_size,
+        seed=recipe.seed * 1_000_003 + index,
+        noise=L * noise_of(recipe, index),
+        contacts=recipe.contacts,
+        family="point",
+        force=(4 * recipe.force[0], 4 * recipe.force[1]),
+        force_unit="EI/L^2",
+        distribution="log-uniform",
+        location=recipe.location,
+        min_gap=recipe.min_gap if recipe.contacts > 1 else 0.0,
+        width=None,
+        markers=tuple(s.tolist()),
+        tension=(0.0, top) if len(robot.tendons) else None,
+        gravity=None,
+    )
+    data = {name: torch.from_numpy(value) for name, value in simulate_shard(spec, 0).items()}
+    eta = torch.logit((data["location"] / L).clamp(max=FARTHEST_LOAD)).unsqueeze(-1)
+    log_c = torch.full_like(eta, prior_log_c(model_of(recipe, robot, prior)))
+    gamma = torch.cat([data["force"] / robot.rod.force_scale, eta, log_c], -1).flatten(1)
+    return Draw(robot, Markers(data["s"], data["positions"], None, data["tension"] if len(robot.tendons) else None), gamma)
+
+
+def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
+    """Distributed loads, cubic in s. No Gaussians are the truth; the answer is the one that is found from a cold start."""
+    generator = generator_of(recipe, index)
+    robot, _ = random_robot(recipe, generator)
+    B, s = recipe.block_size, L * layout(recipe, index, generator)
+    knots = 2 * torch.rand(B, 2, 4, generator=generator) - 1
+    powers = torch.linspace(0, 1, 4).unsqueeze(-1) ** torch.arange(4)
+    low, high = recipe.force
+    size = low * (high / low) ** torch.rand(B, 1, 1, generator=generator) * robot.rod.force_scale / L
+    load = PolynomialLoads(size * torch.linalg.solve(powers, knots.unsqueeze(-1)).squeeze(-1), L)
+    shape = solve_shape(robot, (load,), None, s, B)
+    gamma = model_of(recipe, robot, prior).coordinates.start().expand(B, -1)
+    noisy = shape.p + L * noise_of(recipe, index) * torch.randn(shape.p.shape, generator=generator)
+    return Draw(robot, Markers(s, noisy), gamma)
+
+
+def model_of(recipe: Recipe, robot: Robot, prior: str) -> Model:
+    """The model whose starts are learned."""
+    return Model(robot, GaussianCoordinates(recipe.contacts, L, robot.rod.force_scale, prior))
+
+
+def with_gaps(markers: Markers, generator: torch.Generator) -> Markers:
+    """Up to half of the markers missing, but LEAST_SEEN there."""
+    B, P = markers.positions.shape[:2]
+    gone = (torch.rand(B, 1, generator=generator) * (P - max(LEAST_SEEN, P // 2) + 1)).floor()
+    rank = torch.rand(B, P, generator=generator).argsort(-1).argsort(-1)
+    positions = torch.where((rank < gone).unsqueeze(-1), torch.nan, markers.positions)
+    return Markers(markers.s, positions, markers.offsets, markers.tension)
+
+
+def information(model: Model, markers: Markers, noise: float, x: Float[Tensor, "B n"], size: int) -> Float[Tensor, "B g g"]:
+    """M: the information on gamma with alpha eliminated, so that d^T M d is what an error d in gamma costs."""
+    A = linearize(model, x, markers, model.weights(markers, noise)).A
+    cross = A[:, :size, size:]
+    return A[:, :size, :size] - cross @ torch.linalg.solve(A[:, size:, size:], cross.mT)
+
+
+def in_order(gamma: Float[Tensor, "B n"], M: Float[Tensor, "B n n"]) -> tuple[Tensor, Tensor]:
+    """Loads from the base to the tip: which is which must not be left to chance."""
+    order = gamma.unflatten(-1, (-1, PER_LOAD))[..., 2].argsort(-1)
+    index = (PER_LOAD * order.unsqueeze(-1) + torch.arange(PER_LOAD)).flatten(1)
+    rows = index.unsqueeze(-1).expand_as(M)
+    return gamma.gather(1, index), M.gather(1, rows).gather(2, index.unsqueeze(1).expand_as(M))
+
+
+def answered(model: Model, markers: Markers, noise: float, gamma: Float[Tensor, "B n"], iterations: int) -> Float[Tensor, "B n"]:
+    """x after so many iterations of the filter from a truth gamma. The start counts as cold: the answer is wanted as it is."""
+
+    def at_truth(model: Model, markers: Markers, noise: float) -> Start:
+        x = model.join(gamma, equilibrium_wrench(model, model.coordinates.loads(gamma), markers))
+        return Start(torch.where(x.isnan(), cold_start(model, markers, noise).x, x), None, torch.zeros(len(x), dtype=torch.bool))
+
+    return estimate(model, markers, noise, Settings(max_iterations=iterations, restarts=()), at_truth).x
+
+
+def block(recipe: Recipe, index: int) -> dict[str, Tensor]:
+    """x, amp, log_c, target and M in the canonical frame, and the markers seen: float32, one row per case."""
+    prior, noise = recipe.priors[index % len(recipe.priors)], L * noise_of(recipe, index)
+    draw = (contacts if recipe.load == "contacts" else smooth)(recipe, index, prior)
+    model, markers = model_of(recipe, draw.robot, prior), with_gaps(draw.markers, generator_of(recipe, 10_000_019 + index))
+    size, log_c = PER_LOAD * recipe.contacts, prior_log_c(model)
+    rows = []
+    for i in torch.arange(len(markers.positions)).split(CHUNK):
+        part = markers.take(i)
+        x = answered(model, part, noise, draw.gamma[i], recipe.target_iterations)
+        target, M = in_order(x[:, :size], information(model, part, noise, x, size))
+        read = features(model, part, noise)
+        turn = turn_of_gamma(read.turn, recipe.contacts)
+        target, M = (turn @ target.unsqueeze(-1)).squeeze(-1), turn @ M @ turn.mT
+        good = torch.isfinite(target).all(-1) & torch.isfinite(M).flatten(1).all(-1)
+        row = (read.x, read.amp, torch.full_like(read.amp, log_c), target, M, read.seen)
+        rows.append([value[good].float() for value in row])
+    return {name: torch.cat(values) for name, values in zip(COLUMNS, zip(*rows, strict=True), strict=True)}
