@@ -1,0 +1,101 @@
+"""How many loads: the score test, the stages, the evidence that is reported."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from tests.robots import T, steel_rod
+from torchrod import GaussianCoordinates, GaussianLoads, Markers, Model, PointForces, PointWrenches, estimate, solve_shape
+from torchrod.cli import main
+from torchrod.probe import probe
+
+S = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
+ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"
+FORCES = {0: [], 1: [(0.3, -0.6, 0.22)], 2: [(0.8, 0.2, 0.15), (-0.5, 0.7, 0.33)]}
+
+
+def markers_of(loads, count: int, seed: int, noise: float = 1e-3) -> Markers:
+    shape = solve_shape(steel_rod(), loads, None, S, count)
+    draw = torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return Markers(S, shape.p + noise * draw)
+
+
+def pushes(contacts: int) -> tuple:
+    rows = FORCES[contacts]
+    return (PointForces(T([[[x, y, 0.0] for x, y, _ in rows]]), T([[s for *_, s in rows]])),) if rows else ()
+
+
+def model_of(contacts: int) -> Model:
+    robot = steel_rod()
+    return Model(robot, GaussianCoordinates(contacts, 0.4, robot.rod.force_scale))
+
+
+def test_without_a_load_the_score_is_chi_square():
+    """At one place the drop has 2 degrees of freedom (mean 2); the best of 16 correlated places stays below what BIC asks for."""
+    markers = markers_of((), 200, 0)
+    fit = estimate(model_of(0), markers, 1e-3)
+    drop = probe(model_of(0), fit.x, markers, 1e-3).drop
+    assert 2.0 < float(drop.mean()) < 6.0
+    assert (drop > 3 * math.log(60)).double().mean() < 0.03
+
+
+def test_the_score_points_at_the_missing_load():
+    """A push of 0.3 N bends the rod by 50 mm: place to the spacing of the places, force to a third, from the fit without load."""
+    push = (PointForces(T([[[0.0, 0.3, 0.0]]]), T([[0.3]])),)
+    markers = markers_of(push, 20, 1)
+    fit = estimate(model_of(0), markers, 1e-3)
+    found = probe(model_of(0), fit.x, markers, 1e-3)
+    assert (found.drop > 3 * math.log(60)).all()
+    assert ((0.4 * torch.sigmoid(found.eta) - 0.3).abs() < 0.04).all()
+    assert (found.force * steel_rod().rod.force_scale - T([0.0, 0.3])).abs().max() < 0.1
+
+
+def run(folder, markers: Markers, *options: str) -> list[dict]:
+    (folder / "r.toml").write_text(ROD)
+    rows = ["sample,s,x,y,z"]
+    for b, p in enumerate(markers.positions):
+        rows += [f"{b},{float(s)!r},{','.join(repr(float(v)) for v in q)}" for s, q in zip(markers.s, p, strict=True)]
+    (folder / "s.csv").write_text("\n".join(rows) + "\n")
+    out = folder / "o.json"
+    assert main(["estimate", str(folder / "r.toml"), str(folder / "s.csv"), "--out", str(out), *options]) == 0
+    return json.loads(out.read_text())["results"]
+
+
+@pytest.mark.parametrize("contacts", [0, 1, 2])
+def test_the_count_is_found_and_its_evidence_told(contacts, tmp_path):
+    results = run(tmp_path, markers_of(pushes(contacts), 6, 3), "--contacts", "auto")
+    for sample in results:
+        assert sample["evidence"]["chosen"] == str(contacts)
+        assert len(sample["loads"]) == contacts
+        known = {name: bic for name, bic in sample["evidence"]["bic"].items() if bic is not None}
+        assert min(known, key=lambda name: known[name]) == str(contacts)
+        for load, (x, y, s) in zip(sorted(sample["loads"], key=lambda v: v["location_m"]), FORCES[contacts], strict=True):
+            assert abs(load["location_m"] - s) < 0.03
+            assert abs(load["magnitude_N"] - math.hypot(x, y)) < 0.4
+
+
+def test_a_push_at_the_tip_competes(tmp_path):
+    tip = (PointWrenches(T([[[0.2, 0.1, -0.3]]]), T([[[0.0, 0.0, 0.0]]]), T([0.4])),)
+    for sample in run(tmp_path, markers_of(tip, 3, 4), "--contacts", "auto", "--unknown-tip", "force"):
+        assert sample["evidence"]["chosen"] == "0 + tip force"
+        assert abs(sample["tip"]["force_N"][0] - 0.2) < 5 * sample["tip"]["std"]["force_N"][0]
+
+
+def test_what_one_sample_chooses_does_not_depend_on_its_neighbours(tmp_path):
+    both = torch.cat([markers_of(pushes(k), 1, 5).positions for k in (0, 2, 1)])
+    together = run(tmp_path, Markers(S, both), "--contacts", "auto")
+    for b, sample in enumerate(together):
+        (alone,) = run(tmp_path, Markers(S, both[b : b + 1]), "--contacts", "auto")
+        assert alone["evidence"]["chosen"] == sample["evidence"]["chosen"]
+        for one, other in zip(alone["loads"], sample["loads"], strict=True):
+            assert abs(one["magnitude_N"] - other["magnitude_N"]) < 1e-9
+
+
+def test_a_wide_load_is_told_from_a_contact(tmp_path):
+    """Markers must be good for that: the width hardly shows."""
+    wide = (GaussianLoads(T([[[4.0, 0.0]]]), T([[0.25]]), T([[0.5 / 0.1**2]])),)
+    for loads, prior in ((wide, "distributed"), (pushes(1), "contact")):
+        for sample in run(tmp_path, markers_of(loads, 3, 6, 5e-5), "--load-prior", "auto", "--noise", "5e-5"):
+            assert sample["evidence"]["chosen"] == f"1 {prior}"
