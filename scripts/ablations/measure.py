@@ -29,8 +29,9 @@ TIMED_BATCH = 256
 @dataclass(frozen=True)
 class Run:
     """One start over the B samples of a case: iterations of all attempts, outcomes, cost, mean |error| of a sample's loads in
-    location (m) and magnitude (N), and wall and CPU seconds for the whole batch. excess: what further iterations still take off the cost, NaN
-    where the fit had not converged.
+    location (m) and magnitude (N), and wall and CPU seconds for the whole batch.
+
+    excess: what further iterations still take off the cost, NaN where the fit had not converged.
     """
 
     iterations: Tensor

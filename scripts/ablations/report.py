@@ -197,9 +197,9 @@ COSTS = f"""Left to gain: what up to {FURTHER} further Gauss-Newton iterations t
 largest / the 99 % point / the largest of accepted fits. (A fit that cannot explain the data has also converged when it would gain
 less than 1e-6 of its chi^2, which may be more than {WORSE}.)
 
-Times: CPU time of one thread, batch of {TIMED_BATCH}, the fastest of three calls; guess and check: the network, the forward solve of its
-base wrench, a cold start and the cost of both. Whole batch: the fastest of {REPEATS} runs, everything included (the oracle gets
-its start for nothing).
+Times: CPU time of one thread, batch of {TIMED_BATCH}, the fastest of three calls; guess and check: the network, the forward solve
+of its base wrench, a cold start and the cost of both. Whole batch: the fastest of {REPEATS} runs, everything included (the oracle
+gets its start for nothing).
 """
 
 
