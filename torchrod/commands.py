@@ -15,6 +15,7 @@ from .coordinates import GaussianCoordinates
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
+from .features import features
 from .io import (
     RESULT_SUFFIXES,
     Shapes,
@@ -126,7 +127,7 @@ def _starts(options: Namespace, models: list[Model], markers: Markers) -> Callab
     if None not in reasons:
         nearest = min(range(len(models)), key=lambda k: abs(models[k].coordinates.size - 4 * named.card["contacts"]))
         raise InputError(f"--warm-start {options.warm_start}: {reasons[nearest]}")
-    read = named.read_markers(models[reasons.index(None)], markers, options.noise)
+    read = features(models[reasons.index(None)], markers, options.noise)
     outside = int((~named.known(markers, read)).sum())
     if outside:
         warnings.warn(f"{options.warm_start}: {outside} samples lie outside of what it knows and start cold", stacklevel=2)

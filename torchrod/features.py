@@ -25,14 +25,13 @@
 Source: kriging, e.g. Rasmussen & Williams 2006, eq. (2.23); what to feed and to divide by: measured (docs/training.md).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .measurement import Markers
+from .measurement import Markers, Model
 from .robot import Robot
 from .rod import DTYPE
 from .statics import solve_shape
@@ -52,13 +51,18 @@ MIRROR_MARGIN = 1e-6  # a bend this planar (in amp) is not mirrored: round-off m
 class Features:
     """x (B, n): the input. amp (B,): the rms curvature, 1 / L. turn (B, 2, 2): canonical frame = turn @ section frame (orthogonal).
 
-    seen (B,): markers that were seen.
+    seen (B,): markers that were seen. alpha (B, 6): the base wrench without the unknown load (N, N m), zero where there is none.
     """
 
     x: Float[Tensor, "B n"]
     amp: Float[Tensor, " B"]
     turn: Float[Tensor, "B 2 2"]
     seen: Float[Tensor, " B"]
+    alpha: Float[Tensor, "B 6"]
+
+    def take(self, index: Int[Tensor, " b"]) -> "Features":
+        """The samples of an index."""
+        return Features(*(getattr(self, f.name)[index] for f in fields(self)))
 
 
 def is_active(robot: Robot) -> bool:
@@ -90,16 +94,6 @@ def smoothed(
     return out[:, :GRID], out[:, GRID:]
 
 
-def _unloaded(robot: Robot, markers: Markers, s: Float[Tensor, " S"]) -> Float[Tensor, "B S 3"]:
-    """The robot without the unknown load (m); a straight one where there is none to be found."""
-    B = len(markers.positions)
-    straight = torch.nn.functional.pad(s.unsqueeze(-1), (2, 0)).expand(B, -1, -1)
-    if not is_active(robot):
-        return straight
-    p = solve_shape(robot, (), markers.tension, s, B).p
-    return torch.where(torch.isfinite(p), p, straight)
-
-
 def _canonical(bend: Float[Tensor, "B G 2"], amp: Float[Tensor, " B"]) -> Float[Tensor, "B 2 2"]:
     """(4), from the lateral curvature. The second row decides by the curvature beside the net bend, weighted towards the base."""
     net = bend.sum(1)
@@ -111,38 +105,47 @@ def _canonical(bend: Float[Tensor, "B G 2"], amp: Float[Tensor, " B"]) -> Float[
     return torch.stack([e, sign.unsqueeze(-1) * across], 1)
 
 
-def features(robot: Robot, markers: Markers, noise: float, log_c: float) -> Features:
-    """(1)-(5). noise: m. log_c: the prior mean of log(c L^2). B samples; a sample without markers reads as an unbent rod."""
-    L, seen = robot.rod.length, markers.present
+def features(model: Model, markers: Markers, noise: float) -> Features:
+    """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod; one forward solve serves all."""
+    L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
+    stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
+    places = torch.cat([markers.s, stations])
+    rest = solve_shape(model.robot, (), markers.tension, places, len(seen), model.steps)
+    straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
+    p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
     sigma = torch.tensor(noise / L, dtype=DTYPE)
-    y = (markers.positions - _unloaded(robot, markers, markers.s)) / L
-    y, k = smoothed(markers.s / L, y, seen, float(sigma))
+    y, k = smoothed(markers.s / L, (markers.positions - p0[:, :P]) / L, seen, noise / L)
     amp = k[..., :2].square().sum(-1).mean(-1).sqrt().clamp(min=AMP_LEAST)
     turn = _canonical(k[..., :2], amp)
 
     def turned(v: Float[Tensor, "B S 3"]) -> Float[Tensor, "B S3"]:
         return torch.cat([v[..., :2] @ turn.mT, v[..., 2:]], -1).flatten(1)
 
-    size, count = amp.unsqueeze(-1), seen.sum(-1).to(DTYPE)
+    size, count, log_c = amp.unsqueeze(-1), seen.sum(-1).to(DTYPE), torch.full_like(amp, prior_log_c(model))
     parts = [5 * turned(y) / size, (k[..., :2] @ turn.mT).flatten(1) / size, size.log(), size]
-    context = torch.stack([sigma.log().expand_as(amp), (sigma / amp).log(), torch.full_like(amp, log_c)], -1)
-    parts += [context, (20 / count.clamp(min=1)).log().unsqueeze(-1)]
-    if is_active(robot):
-        parts += _known(robot, markers, turned)
-    return Features(torch.cat(parts, -1), amp, turn, count)
+    parts += [torch.stack([sigma.log().expand_as(amp), (sigma / amp).log(), log_c, (20 / count.clamp(min=1)).log()], -1)]
+    if is_active(model.robot):
+        pull, moment, weight = _known(model.robot, markers, stations)
+        moment = turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1)
+        parts += [pull, moment, turned(weight), turned(p0[:, P:] / L)]
+    return Features(torch.cat(parts, -1), amp, turn, count, rest.base_wrench.nan_to_num(0.0))
 
 
-def _known(robot: Robot, markers: Markers, turned: Callable[[Tensor], Tensor]) -> list[Tensor]:
-    """The tendons', the weight's and the unloaded shape's share of (5)."""
-    rod, L, B = robot.rod, robot.rod.length, len(markers.positions)
-    stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
+def prior_log_c(model: Model) -> float:
+    """The prior mean of log(c L^2), which closes every Gaussian load's entries of gamma."""
+    return float(model.coordinates.prior()[0][-1])
+
+
+def _known(
+    robot: Robot, markers: Markers, stations: Float[Tensor, " S"]
+) -> tuple[Float[Tensor, "B S"], Float[Tensor, "B S 3"], Float[Tensor, "B 1 3"]]:
+    """The tendons' pull and moment and the weight of (5)."""
+    rod, B = robot.rod, len(markers.positions)
     pull, moment = torch.zeros(B, STATIONS, dtype=DTYPE), torch.zeros(B, STATIONS, 3, dtype=DTYPE)
     if markers.tension is not None and len(robot.tendons):
         tension = markers.tension.nan_to_num(0.0)
         on = torch.stack([stations <= t.ends_at * (1 + 1e-9) for t in robot.tendons.tendons]).to(DTYPE)
         r = torch.stack([t.offset_at(stations)[0] for t in robot.tendons.tendons])
         pull = tension @ on / rod.force_scale
-        moment = torch.einsum("bt,tg,tgc->bgc", tension, on, r) * (L / rod.bending_stiffness)
-    weight = (robot.weight * L / rod.force_scale).expand(B, 3).unsqueeze(1)
-    shape = _unloaded(robot, markers, stations) / L
-    return [pull, turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1), turned(weight), turned(shape)]
+        moment = torch.einsum("bt,tg,tgc->bgc", tension, on, r) * (rod.length / rod.bending_stiffness)
+    return pull, moment, (robot.weight * rod.length / rod.force_scale).expand(B, 3).unsqueeze(1)

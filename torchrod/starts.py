@@ -17,12 +17,13 @@ class Start:
     """Where B samples start: x (B, n) in the model's coordinates.
 
     Sigma0: the covariance (B, n, n) to start with; None leaves it to the settings. warm: (B,), which samples start from a guess;
-    the others start cold, from no load.
+    the others start cold, from no load. cold: x of a cold start, if the rule has it at hand.
     """
 
     x: Float[Tensor, "B n"]
     Sigma0: Float[Tensor, "B n n"] | None
     warm: Bool[Tensor, " B"]
+    cold: Float[Tensor, "B n"] | None = None
 
 
 StartRule = Callable[[Model, Markers, float], Start]
@@ -36,9 +37,13 @@ def equilibrium_wrench(model: Model, loads: tuple[Load, ...], markers: Markers) 
 
 def cold_start(model: Model, markers: Markers, noise: float) -> Start:
     """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
-    B = len(markers.positions)
-    x = model.join(model.coordinates.start().expand(B, -1), equilibrium_wrench(model, (), markers))
-    return Start(x, None, torch.zeros(B, dtype=torch.bool))
+    x = cold_from(model, equilibrium_wrench(model, (), markers))
+    return Start(x, None, torch.zeros(len(x), dtype=torch.bool))
+
+
+def cold_from(model: Model, alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:
+    """x of a cold start, from the base wrench (N, N m) of the robot without load."""
+    return model.join(model.coordinates.start().expand(len(alpha), -1), alpha)
 
 
 def residual_and_cost(
@@ -64,15 +69,15 @@ def better_start(
         return start, start.warm
     part = markers.take(index)
     w = model.weights(part, noise)
-    cold = cold_start(model, part, noise)
+    cold = cold_start(model, part, noise).x if start.cold is None else start.cold[index]
 
     def cost(x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
         value = residual_and_cost(model, part, w, x, model.h(x, part, differentiable=False))[1]
         return value.nan_to_num(torch.inf)
 
-    worse = ~(cost(start.x[index]) < cost(cold.x))
+    worse = ~(cost(start.x[index]) < cost(cold))
     dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
     x = start.x.clone()
-    x[dropped] = cold.x[worse]
+    x[dropped] = cold[worse]
     spread = None if start.Sigma0 is None else torch.where(dropped[:, None, None], Sigma0, start.Sigma0)
     return Start(x, spread, start.warm & ~dropped), dropped

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from .coordinates import GaussianCoordinates
 from .errors import InputError
-from .features import Features, features, is_active
+from .features import Features, features, is_active, prior_log_c
 from .measurement import Markers, Model
-from .network import Network, Prediction, load_checkpoint, turn_of_gamma
+from .network import PER_LOAD, Network, Prediction, load_checkpoint, turn_of_gamma
 from .rod import Rod
-from .starts import Start, cold_start, equilibrium_wrench
+from .starts import Start, cold_from, cold_start, equilibrium_wrench
 
 SLACK = 1.001  # on a stated range: 0.1 mm on 0.4 m is 2.5e-4 but for round-off
 SPREAD = (0.1, 1e4)  # least and largest eigenvalue of Sigma0
@@ -54,10 +54,6 @@ class WarmStart:
             reason = _noise_misfit(self.card, noise / model.robot.rod.length)
         return reason if reason is not None or markers is None else _markers_misfit(self.card, markers)
 
-    def read_markers(self, model: Model, markers: Markers, noise: float) -> Features:
-        """What the network reads."""
-        return features(model.robot, markers, noise, float(model.coordinates.prior()[0][-1]))
-
     def known(self, markers: Markers, read: Features) -> Bool[Tensor, " B"]:
         """Samples whose bend and number of markers lie in the range that was learned."""
         (low, high), (fewest, most) = self.card["range"]["amp"], self.card["range"]["markers_seen"]
@@ -66,35 +62,33 @@ class WarmStart:
 
     def predict(self, model: Model, read: Features) -> Prediction:
         """In the canonical frame."""
-        log_c = read.amp.new_full(read.amp.shape, float(model.coordinates.prior()[0][-1]))
-        return self.network(read.x, read.amp, log_c)
+        return self.network(read.x, read.amp, torch.full_like(read.amp, prior_log_c(model)))
 
     def __call__(self, model: Model, markers: Markers, noise: float) -> Start:
         """gamma from the network, alpha from the equilibrium under it; cold where the sample lies outside of what was learned.
 
         Errors: InputError if strict, where the checkpoint does not fit the model or the noise at all.
         """
-        cold, reason = cold_start(model, markers, noise), self.misfit(model, None, noise)
+        reason = self.misfit(model, None, noise)
         if reason is not None and self.strict:
             raise InputError(f"checkpoint {self.card['name']}: {reason}")
         if reason is not None or markers.offsets is not None:
-            return cold
-        read = self.read_markers(model, markers, noise)
-        index = self.known(markers, read).nonzero().squeeze(-1)
+            return cold_start(model, markers, noise)
+        read = features(model, markers, noise)
+        warm, size = self.known(markers, read), model.coordinates.size
+        index, cold = warm.nonzero().squeeze(-1), cold_from(model, read.alpha)
         if not len(index):
-            return cold
-        part = Features(read.x[index], read.amp[index], read.turn[index], read.seen[index])
-        prediction, turn = self.predict(model, part), turn_of_gamma(part.turn, model.coordinates.size // 4)
+            return Start(cold, None, warm)
+        part = read.take(index)
+        prediction, turn = self.predict(model, part), turn_of_gamma(part.turn, size // PER_LOAD)
         gamma = (turn.mT @ prediction.gamma.unsqueeze(-1)).squeeze(-1)
         alpha = equilibrium_wrench(model, model.coordinates.loads(gamma), markers.take(index))
-        x = cold.x.index_copy(0, index, model.join(gamma, alpha))
-        warm = cold.warm.index_fill(0, index, True)
+        x = cold.index_copy(0, index, model.join(gamma, alpha))
         if not self.predicted_spread:
-            return Start(x, None, warm)
+            return Start(x, None, warm, cold)
         Sigma0 = torch.eye(model.size, dtype=x.dtype).repeat(len(x), 1, 1)
-        size = model.coordinates.size
         Sigma0[index, :size, :size] = turn.mT @ bounded(prediction.covariance) @ turn
-        return Start(x, Sigma0, warm)
+        return Start(x, Sigma0, warm, cold)
 
 
 def bounded(covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:

@@ -28,7 +28,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.estimator import CHUNK, linearize
-from torchrod.features import features
+from torchrod.features import features, prior_log_c
 from torchrod.network import PER_LOAD, turn_of_gamma
 from torchrod.starts import equilibrium_wrench
 
@@ -37,7 +37,6 @@ LEAST_SEEN = 8
 TENDON_SHARE = 0.09  # of the rod's own stiffness: below it the strain balance needs few steps
 FARTHEST_LOAD = 0.998  # eta is finite there
 COLUMNS = ("x", "amp", "log_c", "target", "M", "seen")
-SMOOTH_NOISE = 1e-3  # the clean fit of a smooth load is told this, so that it settles
 
 
 @dataclass(frozen=True)
@@ -142,13 +141,13 @@ def contacts(recipe: Recipe, index: int, prior: str) -> Draw:
     )
     data = {name: torch.from_numpy(value) for name, value in simulate_shard(spec, 0).items()}
     eta = torch.logit((data["location"] / L).clamp(max=FARTHEST_LOAD)).unsqueeze(-1)
-    log_c = torch.full_like(eta, log_c_of(model_of(recipe, robot, prior)))
+    log_c = torch.full_like(eta, prior_log_c(model_of(recipe, robot, prior)))
     gamma = torch.cat([data["force"] / robot.rod.force_scale, eta, log_c], -1).flatten(1)
     return Draw(robot, Markers(data["s"], data["positions"], None, data["tension"] if len(robot.tendons) else None), gamma)
 
 
 def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
-    """Distributed loads, cubic in s; the truth is what the filter makes of the markers without noise."""
+    """Distributed loads, cubic in s. No Gaussians are the truth; the answer is the one that is found from a cold start."""
     generator = generator_of(recipe, index)
     robot, _ = random_robot(recipe, generator)
     B, s = recipe.block_size, L * layout(recipe, index, generator)
@@ -158,9 +157,7 @@ def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
     size = low * (high / low) ** torch.rand(B, 1, 1, generator=generator) * robot.rod.force_scale / L
     load = PolynomialLoads(size * torch.linalg.solve(powers, knots.unsqueeze(-1)).squeeze(-1), L)
     shape = solve_shape(robot, (load,), None, s, B)
-    clean = Markers(s, shape.p)
-    fit = estimate(model_of(recipe, robot, prior), clean, SMOOTH_NOISE, Settings(max_iterations=25, restarts=()))
-    gamma = fit.x[:, : PER_LOAD * recipe.contacts]
+    gamma = model_of(recipe, robot, prior).coordinates.start().expand(B, -1)
     noisy = shape.p + L * noise_of(recipe, index) * torch.randn(shape.p.shape, generator=generator)
     return Draw(robot, Markers(s, noisy), gamma)
 
@@ -168,11 +165,6 @@ def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
 def model_of(recipe: Recipe, robot: Robot, prior: str) -> Model:
     """The model whose starts are learned."""
     return Model(robot, GaussianCoordinates(recipe.contacts, L, robot.rod.force_scale, prior))
-
-
-def log_c_of(model: Model) -> float:
-    """The prior mean of log(c L^2)."""
-    return float(model.coordinates.prior()[0][-1])
 
 
 def with_gaps(markers: Markers, generator: torch.Generator) -> Markers:
@@ -214,13 +206,13 @@ def block(recipe: Recipe, index: int) -> dict[str, Tensor]:
     prior, noise = recipe.priors[index % len(recipe.priors)], L * noise_of(recipe, index)
     draw = (contacts if recipe.load == "contacts" else smooth)(recipe, index, prior)
     model, markers = model_of(recipe, draw.robot, prior), with_gaps(draw.markers, generator_of(recipe, 10_000_019 + index))
-    size, log_c = PER_LOAD * recipe.contacts, log_c_of(model)
+    size, log_c = PER_LOAD * recipe.contacts, prior_log_c(model)
     rows = []
     for i in torch.arange(len(markers.positions)).split(CHUNK):
         part = markers.take(i)
         x = answered(model, part, noise, draw.gamma[i], recipe.target_iterations)
         target, M = in_order(x[:, :size], information(model, part, noise, x, size))
-        read = features(draw.robot, part, noise, log_c)
+        read = features(model, part, noise)
         turn = turn_of_gamma(read.turn, recipe.contacts)
         target, M = (turn @ target.unsqueeze(-1)).squeeze(-1), turn @ M @ turn.mT
         good = torch.isfinite(target).all(-1) & torch.isfinite(M).flatten(1).all(-1)

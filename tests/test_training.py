@@ -1,0 +1,91 @@
+"""Training: its cases are what they say, and a small run goes through, resumes and repeats itself."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("lightning")
+
+from safetensors.torch import load_file
+
+from torchrod import WarmStart
+from torchrod.features import ACTIVE_SIZE, PASSIVE_SIZE
+from torchrod.tendons import NEWTON_STEPS
+from training.cases import LEAST_SEEN, Recipe, block, generator_of, random_robot
+from training.train import main
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = Recipe(1, "contacts", ("contact", "point"), (0.1, 2.0), blocks=4, block_size=96)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "inputs"),
+    [
+        (SMALL, PASSIVE_SIZE),
+        (replace(SMALL, contacts=2, block_size=48), PASSIVE_SIZE),
+        (replace(SMALL, tendons=(1, 3), weight=1.0, block_size=32), ACTIVE_SIZE),
+        (replace(SMALL, contacts=3, load="smooth", priors=("distributed",), target_iterations=5, block_size=24), PASSIVE_SIZE),
+    ],
+    ids=["one", "two", "tendons", "smooth"],
+)
+def test_a_block_is_a_pure_function_of_its_recipe(recipe, inputs):
+    first, again, other = block(recipe, 1), block(recipe, 1), block(replace(recipe, seed=1), 1)
+    n = 4 * recipe.contacts
+    assert first["x"].shape[1] == inputs
+    assert len(first["x"]) > 0.9 * recipe.block_size
+    assert first["target"].shape[1:] == (n,) and first["M"].shape[1:] == (n, n)
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not torch.equal(first["x"][:5], other["x"][:5])
+    assert (torch.linalg.eigvalsh(first["M"].double()).amin(-1) > -1e-3 * first["M"].abs().amax((-1, -2))).all()
+    assert first["seen"].min() >= LEAST_SEEN
+    eta = first["target"].unflatten(-1, (-1, 4))[..., 2]
+    assert (eta.diff(dim=-1) >= 0).all(), "loads from the base to the tip"
+
+
+def test_the_tendons_stay_soft():
+    """So that the strain balance needs few steps: otherwise the cases take minutes instead of seconds."""
+    recipe = replace(SMALL, tendons=(1, 3), weight=1.0)
+    for index in range(30):
+        robot, top = random_robot(recipe, generator_of(recipe, index))
+        tension = torch.full((1, len(robot.tendons)), top)
+        assert robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension) == NEWTON_STEPS
+
+
+def train(folder: Path, name: str, *options: str) -> Path:
+    """Two epochs on four small blocks."""
+    recipe = {f"--data.recipe.{key}": value for key, value in (("blocks", 4), ("block_size", 96), ("force", [0.1, 2.0]))}
+    arguments = ["--config", str(ROOT / "training" / "configs" / "rod_1.yaml")]
+    for key, value in recipe.items():
+        arguments += [key, json.dumps(value)]
+    arguments += ["--data.cache", str(folder / "cache"), "--data.workers", "1", "--data.batch_size", "64", "--model.width", "16"]
+    arguments += ["--trainer.logger.init_args.save_dir", str(folder / "runs"), "--trainer.callbacks.name", name]
+    torch.set_default_dtype(torch.float32)
+    main([*arguments, "--trainer.callbacks.folder", str(folder / "out"), *options])
+    torch.set_default_dtype(torch.float64)
+    return folder / "out" / f"{name}.safetensors"
+
+
+def test_a_small_run_repeats_itself_and_resumes(tmp_path):
+    threads = torch.get_num_threads()
+    try:
+        epochs = ("--trainer.max_epochs", "2")
+        once, twice = train(tmp_path, "a", *epochs), train(tmp_path, "b", *epochs)
+        weights = load_file(once)
+        assert all(torch.equal(weights[name], value) for name, value in load_file(twice).items())
+        stopped = train(tmp_path, "c", *epochs, "--trainer.limit_train_batches", "0")
+        assert any(not torch.equal(weights[name], value) for name, value in load_file(stopped).items())
+        (last, *_) = sorted(tmp_path.glob("runs/rod_1/version_0/checkpoints/last.ckpt"))
+        resumed = train(tmp_path, "d", "--trainer.max_epochs", "3", "--ckpt_path", str(last))
+        card = json.loads(resumed.with_suffix(".json").read_text())
+        assert card["epochs"] == 3
+        assert any(not torch.equal(weights[name], value) for name, value in load_file(resumed).items())
+    finally:
+        torch.set_num_threads(threads)
+        torch.use_deterministic_algorithms(False)
+    assert (tmp_path / "runs/rod_1/version_0/curves.png").stat().st_size > 1000
+    start = WarmStart.read(once)
+    assert start.card["contacts"] == 1 and start.network.width == 16
+    assert start.card["cases"] == 2 * 96

@@ -1,0 +1,342 @@
+"""The learned start: what it must not depend on, what it saves, and that it never costs accuracy."""
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.robots import T, csv_of, steel_rod, toml_of
+from tests.study import study1
+from torchrod import (
+    GaussianCoordinates,
+    InputError,
+    Markers,
+    Model,
+    PointCoordinates,
+    Robot,
+    Rod,
+    Settings,
+    Start,
+    Tendon,
+    Tendons,
+    WarmStart,
+    cold_start,
+    estimate,
+    find_warm_start,
+)
+from torchrod.cli import main
+from torchrod.features import GRID, features, smoothed
+from torchrod.network import digest, load_checkpoint, save_checkpoint
+from torchrod.status import Learned
+from torchrod.warmstart import shipped
+
+ROOT = Path(__file__).resolve().parents[1]
+ROD_1 = ROOT / "checkpoints" / "rod_1.safetensors"
+NOISE = 1e-3
+
+
+def model_of(robot: Robot | None = None, count: int = 1, prior: str = "contact") -> Model:
+    robot = robot or steel_rod()
+    return Model(robot, GaussianCoordinates(count, robot.rod.length, robot.rod.force_scale, prior))
+
+
+def noisy(count: int, seed: int = 3) -> tuple[Markers, torch.Tensor]:
+    study = study1(count, seed)
+    draw = torch.randn(study.positions.shape, generator=torch.Generator().manual_seed(seed))
+    return Markers(study.s, study.positions + NOISE * draw), study.force
+
+
+def turned(markers: Markers, angle: float) -> Markers:
+    c, s = math.cos(angle), math.sin(angle)
+    return Markers(markers.s, markers.positions @ T([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
+
+
+def test_smoothing_reads_a_beam_from_any_layout():
+    """A clamped beam under a linear load, seen at uneven places with two markers missing: deflection and curvature on the grid."""
+    s, grid = torch.linspace(0.03, 1.0, 17) ** 1.2, torch.linspace(1 / GRID, 1, GRID)
+    y = torch.stack([s**2 * (20 - 10 * s + s**3) / 120, 0 * s, 0 * s], -1).unsqueeze(0)
+    seen = torch.ones(1, 17, dtype=torch.bool)
+    seen[0, [2, 16]] = False
+    deflection, bend = smoothed(s, torch.where(seen.unsqueeze(-1), y, torch.nan), seen, 1e-5)
+    start = grid - 1 / GRID
+    assert torch.allclose(deflection[0, :, 0], grid**2 * (20 - 10 * grid + grid**3) / 120, atol=2e-5)
+    assert torch.allclose(bend[0, :, 0], (40 - 60 * start + 20 * start**3) / 120, atol=5e-3)
+    assert deflection[0, :, 1:].abs().max() == 0
+
+
+@pytest.mark.parametrize("angle", [0.7, -2.1, math.pi])
+def test_the_prediction_turns_with_the_shape(angle):
+    model, start = model_of(), WarmStart.read(ROD_1)
+    markers, _ = noisy(20)
+    gamma, other = start(model, markers, NOISE).x[:, :4], start(model, turned(markers, angle), NOISE).x[:, :4]
+    c, s = math.cos(angle), math.sin(angle)
+    assert torch.allclose(other[:, :2], gamma[:, :2] @ T([[c, -s], [s, c]]).T, atol=1e-9)
+    assert torch.allclose(other[:, 2:], gamma[:, 2:], atol=1e-9)
+
+
+def test_the_prediction_turns_with_the_mirror_too():
+    model, start = model_of(), WarmStart.read(ROD_1)
+    markers, _ = noisy(20)
+    gamma = start(model, markers, NOISE).x[:, :4]
+    mirrored = start(model, Markers(markers.s, markers.positions * T([1.0, -1.0, 1.0])), NOISE).x[:, :4]
+    assert torch.allclose(mirrored, gamma * T([1.0, -1.0, 1.0, 1.0]), atol=1e-9)
+
+
+def test_the_prediction_does_not_depend_on_the_scale():
+    """Three times as long, a hundred times as stiff, the same slenderness: the same dimensionless answer."""
+    markers, _ = noisy(20)
+    big = Robot(Rod.circular(1.2, 0.0042, 207e11, 79e11))
+    other = Markers(3 * markers.s, 3 * markers.positions)
+    start = WarmStart.read(ROD_1)
+    small = start(model_of(), markers, NOISE)
+    assert torch.allclose(start(model_of(big), other, 3 * NOISE).x, small.x, rtol=0, atol=1e-6)
+    assert small.warm.all()
+
+
+def test_missing_markers_are_filled_in():
+    """A missing marker reads as if it had never been there, and half of them may be missing."""
+    model, start = model_of(), WarmStart.read(ROD_1)
+    markers, force = noisy(20)
+    gone, kept = [1, 8, 19], [i for i in range(20) if i not in (1, 8, 19)]
+    holes = markers.positions.clone()
+    holes[:, gone] = torch.nan
+    a, b = start(model, Markers(markers.s, holes), NOISE), start(model, Markers(markers.s[kept], markers.positions[:, kept]), NOISE)
+    assert torch.allclose(a.x, b.x, atol=1e-6)
+    holes[:, ::2] = torch.nan
+    assert (start(model, Markers(markers.s, holes), NOISE).x[:, :2] - force).norm(dim=-1).median() < 0.15
+    holes[0, :14] = torch.nan
+    assert start(model, Markers(markers.s, holes), NOISE).warm.tolist()[:2] == [False, True], "too few for what it knows: cold"
+
+
+def test_a_samples_answer_does_not_depend_on_its_batch():
+    """With a NaN neighbour, one that is nonsense, and one out of the learned range."""
+    markers, _ = noisy(6)
+    positions = markers.positions.clone()
+    positions[1] = torch.nan
+    positions[2] = 5 * torch.randn(positions[2].shape, generator=torch.Generator().manual_seed(0))
+    positions[3, 6:] = torch.nan
+    model, start, limit = model_of(), WarmStart.read(ROD_1), Settings(max_iterations=15)
+    together = estimate(model, Markers(markers.s, positions), NOISE, limit, start)
+    assert together.warm_started.tolist()[0] and not together.warm_started[3]
+    for i in (0, 2, 3, 4, 5):
+        alone = estimate(model, Markers(markers.s, positions[i : i + 1]), NOISE, limit, start)
+        assert torch.allclose(together.x[i], alone.x[0], rtol=0, atol=1e-9)
+        assert together.iterations[i] == alone.iterations[0]
+        assert together.learned[i] == alone.learned[0]
+
+
+def test_it_saves_iterations_in_study_1():
+    """200 cases with 1 mm noise: the same answers, in less than 0.6 of the iterations."""
+    markers, _ = noisy(200)
+    start = find_warm_start(model_of())
+    assert start is not None and start.card["name"] == "rod_1"
+    cold, warm = estimate(model_of(), markers, NOISE), estimate(model_of(), markers, NOISE, start=start)
+    assert warm.warm_started.double().mean() > 0.98
+    assert warm.iterations.double().mean() < 0.6 * cold.iterations.double().mean()
+    assert warm.accepted.sum() >= cold.accepted.sum()
+    assert torch.allclose(warm.chi2, cold.chi2, atol=0.01)
+    assert (warm.location - cold.location).abs().max() < 2e-3
+
+
+class Wild(torch.nn.Module):
+    """A network gone mad: finite nonsense of the size it is told."""
+
+    def __init__(self, honest, size):
+        super().__init__()
+        self.honest, self.size = honest, size
+
+    def forward(self, x, amp, log_c):
+        prediction = self.honest(x, amp, log_c)
+        return replace(prediction, gamma=prediction.gamma + self.size)
+
+
+@pytest.mark.parametrize("kind", ["random weights", "1e3 forces", "not a number"])
+def test_a_bad_network_never_costs_accuracy(kind):
+    markers, _ = noisy(50)
+    start = WarmStart.read(ROD_1)
+    if kind == "random weights":
+        torch.manual_seed(0)
+        network = start.network
+        for value in network.parameters():
+            value.copy_(torch.randn_like(value) / value.shape[-1] ** 0.5)
+    else:
+        network = Wild(start.network, 1e3 if kind == "1e3 forces" else math.nan)
+    bad = replace(start, network=network)
+    cold, warm = estimate(model_of(), markers, NOISE), estimate(model_of(), markers, NOISE, start=bad)
+    assert warm.accepted.sum() >= cold.accepted.sum()
+    assert (warm.chi2 < cold.chi2 + 0.01).all()
+    assert torch.allclose(warm.force, cold.force, atol=0.02)
+    dropped = warm.learned == int(Learned.DROPPED)
+    assert dropped.any()
+    assert not warm.warm_started[dropped].any()
+    assert "learned start" in warm.message(int(dropped.nonzero()[0, 0]))
+    if kind != "random weights":
+        assert torch.allclose(warm.x, cold.x, atol=1e-9)
+        assert torch.equal(warm.iterations, cold.iterations), "a dropped start costs nothing but its comparison"
+
+
+def test_a_start_that_leads_nowhere_is_followed_by_a_cold_one():
+    """Nearer to the markers than a cold start, so it is tried, but stuck: the cold start's answer is the one reported."""
+    markers, _ = noisy(3)
+    model, limit = model_of(), Settings(max_iterations=12, restarts=())
+    cold = estimate(model, markers, NOISE, limit)
+
+    def stuck(model, markers, noise):
+        tight = torch.eye(model.size).repeat(len(markers.positions), 1, 1)
+        x = cold_start(model, markers, noise).x
+        x = x + 0.5 * (cold.x - x)
+        x[:, 3] = -30.0  # so wide that nothing moves any more
+        return Start(x, tight, torch.ones(len(x), dtype=torch.bool))
+
+    fit = estimate(model, markers, NOISE, limit, stuck)
+    assert fit.accepted.all()
+    retried = fit.learned == int(Learned.RETRIED)
+    assert retried.any()
+    assert (fit.restarts[retried] == 1).all()
+    assert (fit.iterations[retried] > cold.iterations[retried]).all()
+    assert torch.allclose(fit.force, cold.force, atol=0.02)
+    assert "cold start" in fit.message(int(retried.nonzero()[0, 0]))
+
+
+def test_what_does_not_fit_is_said_in_one_sentence():
+    start, steel = WarmStart.read(ROD_1), steel_rod()
+    tendon = Robot(steel.rod, Tendons((Tendon.straight(0.007, 0.0, 0.4),)))
+    stubby = Robot(Rod.circular(0.4, 0.1, 207e9, 79e9))
+    curved = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, reference_curvature=T([[0.0, 1.0, 0.0, 0.0]])))
+    scale, markers = steel.rod.force_scale, noisy(2)[0]
+    reasons = [
+        start.misfit(Model(steel, PointCoordinates(1, 0.4, scale))),
+        start.misfit(Model(steel, GaussianCoordinates(1, 0.4, scale, "contact", (0.2,)))),
+        start.misfit(Model(steel, GaussianCoordinates(1, 0.4, scale), registration=True)),
+        start.misfit(model_of(count=2)),
+        start.misfit(model_of(prior="distributed")),
+        start.misfit(model_of(tendon)),
+        start.misfit(model_of(stubby)),
+        start.misfit(model_of(curved)),
+        start.misfit(model_of(), noise=1e-5),
+        start.misfit(model_of(), Markers(markers.s[:4], markers.positions[:, :4])),
+        start.misfit(model_of(), Markers(markers.s, markers.positions, torch.zeros(20, 3))),
+    ]
+    words = [
+        "Gaussian",
+        "known",
+        "registration",
+        "1 loads",
+        "distributed",
+        "tendons",
+        "shear",
+        "straight",
+        "noise",
+        "markers",
+        "centre",
+    ]
+    for reason, word in zip(reasons, words, strict=True):
+        assert reason is not None and word in reason and "\n" not in reason
+    assert start.misfit(model_of(), markers, NOISE) is None
+    with pytest.raises(InputError, match="noise"):
+        start(model_of(), markers, 1e-5)
+    assert not replace(start, strict=False)(model_of(), markers, 1e-5).warm.any()
+
+
+def test_every_card_agrees_with_its_file():
+    names = {start.card["name"] for start in shipped()}
+    assert {"rod_1", "rod_2", "rod_3", "tendon_1"} <= names
+    for start in shipped():
+        path = ROOT / "checkpoints" / f"{start.card['name']}.safetensors"
+        assert digest(path) == start.card["sha256"]
+        assert start.card["contacts"] == start.network.count == start.card["recipe"]["contacts"]
+        assert start.card["command"].endswith(f"training/configs/{start.card['name']}.yaml")
+        for key in ("seed", "torchrod", "cases", "held_out"):
+            assert key in start.card
+
+
+@pytest.mark.parametrize("harm", ["cut", "foreign", "other", "card", "no card", "schema"])
+def test_a_damaged_checkpoint_is_one_sentence(tmp_path, harm, capsys):
+    path = tmp_path / "rod_1.safetensors"
+    shutil.copy(ROD_1, path)
+    shutil.copy(ROD_1.with_suffix(".json"), path.with_suffix(".json"))
+    card = json.loads(path.with_suffix(".json").read_text())
+    if harm == "cut":
+        path.write_bytes(path.read_bytes()[:1000])
+        card["sha256"] = digest(path)
+    elif harm == "foreign":
+        path.write_text("hello")
+        card["sha256"] = digest(path)
+    elif harm == "other":
+        path.write_bytes(path.read_bytes() + b" ")
+    elif harm == "card":
+        del card["range"]
+    elif harm == "schema":
+        card["schema"] = 99
+    path.with_suffix(".json").write_text(json.dumps(card))
+    if harm == "no card":
+        path.with_suffix(".json").unlink()
+    robot, shapes = files(tmp_path)
+    assert main(["estimate", str(robot), str(shapes), "--warm-start", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "rod_1" in said
+
+
+def files(folder: Path) -> tuple[Path, Path]:
+    robot, shapes = folder / "robot.toml", folder / "shapes.csv"
+    steel = dict(length=0.4, diameter=0.0014, youngs_modulus=207e9, shear_modulus=79e9, weight=None, tendons=[])
+    robot.write_text(toml_of(steel))
+    markers, _ = noisy(1)
+    shapes.write_text(csv_of({"tensions": [], "s": markers.s.tolist(), "positions": markers.positions[0].tolist()}))
+    return robot, shapes
+
+
+def test_the_command_line_starts_where_it_is_told(tmp_path, capsys):
+    robot, shapes = files(tmp_path)
+
+    def run(*options: str) -> dict:
+        out = tmp_path / "result.json"
+        assert main(["estimate", str(robot), str(shapes), "--out", str(out), *options]) == 0
+        return json.loads(out.read_text())["results"][0]
+
+    auto, off, named = run(), run("--warm-start", "off"), run("--warm-start", str(ROD_1))
+    assert (auto["warm_started"], off["warm_started"], named["warm_started"]) == (True, False, True)
+    assert auto["iterations"] < off["iterations"]
+    assert abs(auto["loads"][0]["magnitude_N"] - off["loads"][0]["magnitude_N"]) < 2e-3
+    assert not run("--load-prior", "none")["warm_started"]
+    assert run("--contacts", "auto", "--warm-start", str(ROD_1))["warm_started"]
+    capsys.readouterr()
+    for options, word in ((["--contacts", "2"], "1 loads"), (["--location", "0.2"], "known"), (["--noise", "1e-6"], "noise")):
+        assert main(["estimate", str(robot), str(shapes), "--warm-start", str(ROD_1), *options]) == 2
+        said = capsys.readouterr().err
+        assert word in said and said.count("\n") == 1
+    lines = shapes.read_text().splitlines()
+    far = [lines[0], *(f"{s},0,0,{s}" for s in (line.split(",")[0] for line in lines[1:]))]
+    shapes.write_text("\n".join(far) + "\n")
+    assert not run("--warm-start", str(ROD_1))["warm_started"]
+    assert "1 samples lie outside" in capsys.readouterr().err
+
+
+def test_a_network_without_load_is_within_its_file_format(tmp_path):
+    """What is saved is what is read, to the bit."""
+    network, card = load_checkpoint(ROD_1)
+    save_checkpoint(tmp_path / "a.safetensors", network, card)
+    again, _ = load_checkpoint(tmp_path / "a.safetensors")
+    read = features(model_of(), noisy(3)[0], NOISE)
+    log_c = torch.full((3,), 6.0)
+    assert torch.equal(network(read.x, read.amp, log_c).gamma, again(read.x, read.amp, log_c).gamma)
+
+
+def test_the_library_does_not_need_lightning():
+    code = """
+import sys
+sys.modules["lightning"] = None
+import torch, torchrod
+robot = torchrod.Robot(torchrod.Rod.circular(0.4, 0.0014, 207e9, 79e9))
+model = torchrod.Model(robot, torchrod.GaussianCoordinates(1, 0.4, robot.rod.force_scale))
+assert torchrod.find_warm_start(model) is not None
+assert not [name for name in sys.modules if name.startswith(("lightning.", "pytorch_lightning"))]
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr[-2000:]
