@@ -1,0 +1,65 @@
+"""scripts/ablation.py --quick: the warm start saves iterations, costs nothing, and what has converged has converged."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+CASES = ("study1_1mm", "nitinol", "one_tendon", "reference")
+STARTS = {"cold", "warm", "oracle"}
+ROW = {"iterations_mean", "iterations_median", "iterations_95", "converged", "accepted", "location_m_mean", "force_N_mean"}
+ROW |= {"wall_s", "cpu_s", "warm_started", "iterations_mean_95"}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of a run, with the figures as figures.json."""
+    folder = tmp_path_factory.mktemp("ablation")
+    command = [sys.executable, str(ROOT / "scripts" / "ablation.py"), *CASES, "--quick"]
+    command += ["--json", str(folder / "figures.json"), "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def figures(made):
+    return json.loads((made / "figures.json").read_text())
+
+
+def test_every_figure_is_there(made, figures):
+    assert set(figures) == set(CASES)
+    for name, case in figures.items():
+        for start in STARTS:
+            assert set(case[start]) == ROW, (name, start)
+        assert {"warm_cold", "warm_cold_95", "warm_oracle", "warm_oracle_95"} == set(case["ratio"])
+        assert {"accepted", "location_m", "force_N", "accepted_95", "location_m_95", "force_N_95"} == set(case["difference"])
+        assert set(case["time"]) == {"start_s", "cold_s", "iteration_s"}
+        low, high = case["ratio"]["warm_cold_95"]
+        assert low <= case["ratio"]["warm_cold"] <= high, name
+    for file in ("warm_start.md", "warm_start.png"):
+        assert (made / file).stat().st_size > 500
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_warm_start_costs_nothing(figures, name):
+    case = figures[name]
+    assert case["warm"]["accepted"] >= case["cold"]["accepted"] - 0.02
+    assert case["difference"]["location_m"] < 1e-3
+    assert case["worse"] <= 0.05
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_has_converged_has_converged(figures, name):
+    for start in ("cold", "warm"):
+        assert figures[name]["convergence"][start]["max"] < 0.01
+
+
+@pytest.mark.parametrize("name, bar", [("study1_1mm", 0.75), ("nitinol", 0.75), ("one_tendon", 0.65)])
+def test_a_warm_start_saves_iterations(figures, name, bar):
+    """The bars of docs/warm_start.md, with slack for the few samples of a quick run."""
+    assert figures[name]["warm"]["warm_started"] > 0.8
+    assert figures[name]["ratio"]["warm_cold"] < bar
