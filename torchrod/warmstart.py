@@ -18,7 +18,8 @@ from .rod import Rod
 from .starts import Start, cold_from, cold_start, equilibrium_wrench
 
 SLACK = 1.001  # on a stated range: 0.1 mm on 0.4 m is 2.5e-4 but for round-off
-SPREAD = (0.1, 1e4)  # least and largest eigenvalue of Sigma0
+INFLATION = 10.0  # of the predicted covariance: on cases it has not seen a network errs more than it thinks
+SPREAD = (1.0, 1e4)  # least and largest eigenvalue of Sigma0
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = (PACKAGE.parent / "checkpoints", PACKAGE / "checkpoints")  # of a source tree, of an installed package
 
@@ -92,8 +93,8 @@ class WarmStart:
 
 
 def bounded(covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
-    """With its eigenvalues between SPREAD[0] and SPREAD[1]."""
-    values, vectors = torch.linalg.eigh(covariance)
+    """Times INFLATION, with its eigenvalues between SPREAD[0] and SPREAD[1]."""
+    values, vectors = torch.linalg.eigh(INFLATION * covariance)
     return (vectors * values.clamp(*SPREAD).unsqueeze(-2)) @ vectors.mT
 
 
