@@ -164,7 +164,7 @@ def test_a_bad_network_never_costs_accuracy(kind):
         torch.manual_seed(0)
         network = start.network
         for value in network.parameters():
-            value.copy_(torch.randn_like(value) / value.shape[-1] ** 0.5)
+            value.copy_(3 * torch.randn_like(value) / value.shape[-1] ** 0.5)
     else:
         network = Wild(start.network, 1e3 if kind == "1e3 forces" else math.nan)
     bad = replace(start, network=network)

@@ -18,7 +18,8 @@ from .rod import Rod
 from .starts import Start, cold_from, cold_start, equilibrium_wrench
 
 SLACK = 1.001  # on a stated range: 0.1 mm on 0.4 m is 2.5e-4 but for round-off
-SPREAD = (0.1, 1e4)  # least and largest eigenvalue of Sigma0
+INFLATION = 10.0  # of the predicted covariance: on cases it has not seen a network errs more than it thinks
+SPREAD = (1.0, 1e4)  # least and largest eigenvalue of Sigma0
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = (PACKAGE.parent / "checkpoints", PACKAGE / "checkpoints")  # of a source tree, of an installed package
 
@@ -27,8 +28,9 @@ FOLDERS = (PACKAGE.parent / "checkpoints", PACKAGE / "checkpoints")  # of a sour
 class WarmStart:
     """A learned start, to be given to torchrod.estimate as `start`: a network, and the card of what it knows.
 
-    predicted_spread: let the filter begin with the network's own covariance of gamma instead of the settings' Sigma0; no better
-    (docs/training.md). strict: refuse what the network was not trained for, instead of starting cold there.
+    predicted_spread: let the filter begin with the network's own covariance of gamma instead of the settings' Sigma0; by default
+    as the card has it, which is as it did better (docs/training.md). strict: refuse what the network was not trained for, instead
+    of starting cold there.
     """
 
     network: Network
@@ -41,11 +43,11 @@ class WarmStart:
         """From NAME.safetensors with NAME.json beside it. Errors: InputError in one sentence."""
         network, card = load_checkpoint(Path(path))
         try:
-            _ = [card[key] for key in ("name", "contacts", "load_priors", "active", "tendons")]
+            _ = [card[key] for key in ("name", "contacts", "load_priors", "active", "tendons", "predicted_spread")]
             _ = [len(card["range"][key]) for key in RANGES]
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: its card lacks {error}; train it again") from None
-        return cls(network, card)
+        return cls(network, card, bool(card["predicted_spread"]))
 
     def misfit(self, model: Model, markers: Markers | None = None, noise: float | None = None) -> str | None:
         """Why this start cannot serve a model, and markers and a noise (m) if given, in one sentence; None where it can."""
@@ -92,8 +94,8 @@ class WarmStart:
 
 
 def bounded(covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
-    """With its eigenvalues between SPREAD[0] and SPREAD[1]."""
-    values, vectors = torch.linalg.eigh(covariance)
+    """Times INFLATION, with its eigenvalues between SPREAD[0] and SPREAD[1]."""
+    values, vectors = torch.linalg.eigh(INFLATION * covariance)
     return (vectors * values.clamp(*SPREAD).unsqueeze(-2)) @ vectors.mT
 
 

@@ -147,7 +147,7 @@ def contacts(recipe: Recipe, index: int, prior: str) -> Draw:
 
 
 def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
-    """Distributed loads, cubic in s. No Gaussians are the truth; the answer is the one that is found from a cold start."""
+    """Distributed loads, cubic in s. No Gaussians are the truth: the answer is the one that is found from a cold start."""
     generator = generator_of(recipe, index)
     robot, _ = random_robot(recipe, generator)
     B, s = recipe.block_size, L * layout(recipe, index, generator)

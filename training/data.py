@@ -27,15 +27,23 @@ HELD_OUT = 2  # blocks that are not learned from
 def make_block(recipe: Recipe, folder: Path, index: int) -> None:
     """Write one block, under another name until it is whole; on one thread, so that no sum depends on how it was divided."""
     path = folder / f"{index:04d}.safetensors"
+    part = path.with_suffix(f".{os.getpid()}")
+    before = torch.get_num_threads(), torch.get_default_dtype()
     torch.set_num_threads(1)
     torch.set_default_dtype(torch.float64)
-    part = path.with_suffix(f".{os.getpid()}")
-    save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
+    try:
+        save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
+    finally:
+        torch.set_num_threads(before[0])
+        torch.set_default_dtype(before[1])
     part.replace(path)
 
 
 class Batches(Sampler[list[int]]):
-    """Indices of every batch of an epoch, a pure function of (seed, epoch), so that a run that is resumed repeats itself."""
+    """Indices of every batch of an epoch, a pure function of (seed, epoch), so that a run that is resumed repeats itself.
+
+    They are drawn when the first is asked for: a resumed trainer tells the epoch only after it has asked for the iterator.
+    """
 
     def __init__(self, count: int, size: int, seed: int):
         self.count, self.size, self.seed, self.epoch = count, size, seed, 0
@@ -49,7 +57,7 @@ class Batches(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         order = torch.randperm(self.count, generator=torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch))
-        return iter(order[: len(self) * self.size].reshape(-1, self.size).tolist())
+        yield from order[: len(self) * self.size].reshape(-1, self.size).tolist()
 
 
 class ShapeData(LightningDataModule):

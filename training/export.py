@@ -19,17 +19,20 @@ TAIL = 1e-3  # of the cases on either side lie outside the card's range of amp
 
 
 class Export(Callback):
-    """Writes FOLDER/NAME.safetensors and NAME.json, and the curves as curves.png beside the log."""
+    """Writes FOLDER/NAME.safetensors and NAME.json, and the curves as curves.png beside the log.
 
-    def __init__(self, name: str, folder: str = "checkpoints"):
-        self.path = Path(folder) / f"{name}.safetensors"
+    predicted_spread: whether the filter is to start with the covariance that the network predicts.
+    """
+
+    def __init__(self, name: str, folder: str = "checkpoints", predicted_spread: bool = False):
+        self.path, self.predicted_spread = Path(folder) / f"{name}.safetensors", predicted_spread
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Once, by the first process."""
         if not trainer.is_global_zero:
             return
         assert isinstance(pl_module, WarmStartModule) and pl_module.network is not None
-        save_checkpoint(self.path, pl_module.network, card(trainer, pl_module.data))
+        save_checkpoint(self.path, pl_module.network, {**card(trainer, pl_module.data), "predicted_spread": self.predicted_spread})
         if isinstance(trainer.logger, CSVLogger):
             trainer.logger.save()
             draw_curves(Path(trainer.logger.log_dir))
