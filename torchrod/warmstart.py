@@ -29,7 +29,8 @@ class WarmStart:
     """A learned start, to be given to torchrod.estimate as `start`: a network, and the card of what it knows.
 
     predicted_spread: let the filter begin with the network's own covariance of gamma instead of the settings' Sigma0; by default
-    as the card has it, which is as it did better (docs/training.md). strict: refuse what the network was not trained for, instead of starting cold there.
+    as the card has it, which is as it did better (docs/training.md). strict: refuse what the network was not trained for, instead
+    of starting cold there.
     """
 
     network: Network
