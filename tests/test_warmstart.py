@@ -318,8 +318,8 @@ def test_the_command_line_starts_where_it_is_told(tmp_path, capsys):
     assert "1 samples lie outside" in capsys.readouterr().err
 
 
-def test_a_network_without_load_is_within_its_file_format(tmp_path):
-    """What is saved is what is read, to the bit."""
+def test_what_is_saved_is_what_is_read(tmp_path):
+    """To the bit."""
     network, card = load_checkpoint(ROD_1)
     save_checkpoint(tmp_path / "a.safetensors", network, card)
     again, _ = load_checkpoint(tmp_path / "a.safetensors")

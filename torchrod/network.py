@@ -110,6 +110,7 @@ def save_checkpoint(path: Path, network: Network, card: dict[str, Any]) -> None:
     state = {name: value.detach().cpu().float().contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(state, path)
+    path.chmod(0o644)  # safetensors leaves it to its owner alone, and an installed package is read by all
     sizes = {key: getattr(network, key) for key in ("inputs", "count", "width", "depth")}
     full = {"schema": SCHEMA, "name": path.stem, **card, "network": sizes, "sha256": digest(path)}
     path.with_suffix(".json").write_text(json.dumps(full, indent=1) + "\n", encoding="utf-8")
