@@ -34,7 +34,7 @@ from torch import Tensor
 from .measurement import Markers, Model
 from .robot import Robot
 from .rod import DTYPE
-from .statics import solve_shape
+from .statics import ROUGH_TOLERANCE, solve_shape
 
 GRID = 20  # points of the grid
 STATIONS = 4  # where the known loads are described
@@ -110,7 +110,7 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
     L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
     stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
     places = torch.cat([markers.s, stations])
-    rest = solve_shape(model.robot, (), markers.tension, places, len(seen), model.steps)
+    rest = solve_shape(model.robot, (), markers.tension, places, len(seen), model.steps, ROUGH_TOLERANCE)
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
     p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
     sigma = torch.tensor(noise / L, dtype=DTYPE)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from .loads import Load
 from .measurement import Markers, Model
-from .statics import solve_shape
+from .statics import ROUGH_TOLERANCE, solve_shape
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ StartRule = Callable[[Model, Markers, float], Start]
 
 def equilibrium_wrench(model: Model, loads: tuple[Load, ...], markers: Markers) -> Float[Tensor, "B 6"]:
     """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found."""
-    shape = solve_shape(model.robot, loads, markers.tension, markers.s[-1:], len(markers.positions), model.steps)
+    shape = solve_shape(model.robot, loads, markers.tension, markers.s[-1:], len(markers.positions), model.steps, ROUGH_TOLERANCE)
     return shape.base_wrench.nan_to_num(0.0)
 
 

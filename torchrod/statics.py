@@ -23,6 +23,7 @@ from .step import STATE_PARTS, Section, StageTable, State, section_wrench
 from .tendons import strains_settled
 
 ORIENTATION_TOLERANCE = 1e-11  # rad: the forward solve's residual, far below what RK4 leaves
+ROUGH_TOLERANCE = 1e-5  # rad: enough where a filter starts
 INCREMENT_TOLERANCE = 1e-3  # rad: enough on the way to the full load
 MAX_NEWTON = 40
 LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put on in increments, to stay on the principal branch
@@ -180,11 +181,11 @@ def turned(w: Vector, q: Quaternion) -> Quaternion:
 
 
 def _newton(
-    problem: _TipProblem, q: Quaternion, fraction: Float[Tensor, " B"], mine: Bool[Tensor, " B"]
+    problem: _TipProblem, q: Quaternion, fraction: Float[Tensor, " B"], mine: Bool[Tensor, " B"], tolerance: float
 ) -> tuple[Quaternion, Float[Tensor, " B"], Int[Tensor, " B"]]:
     """Damped Newton on the tip's orientation: the best orientation, its residual (rad) and the iterations taken."""
     best = torch.full_like(fraction, torch.inf)
-    tolerance = torch.where(fraction < 1, INCREMENT_TOLERANCE, ORIENTATION_TOLERANCE)
+    enough = torch.where(fraction < 1, max(INCREMENT_TOLERANCE, tolerance), tolerance)
     anchor, turn, damping = q, torch.zeros_like(q[..., :3]), torch.ones_like(best)
     iterations = torch.zeros(best.shape, dtype=torch.int64)
     for _ in range(MAX_NEWTON):
@@ -193,7 +194,7 @@ def _newton(
         better = size < best
         anchor, turn = torch.where(better.unsqueeze(-1), q, anchor), torch.where(better.unsqueeze(-1), step, turn)
         best, damping = torch.where(better, size, best), torch.where(better, 1.0, 0.5 * damping)
-        active = mine & (best > tolerance) & torch.isfinite(best) & (damping > 1e-3)
+        active = mine & (best > enough) & torch.isfinite(best) & (damping > 1e-3)
         iterations = iterations + active
         if not active.any():
             break
@@ -219,11 +220,13 @@ def solve_shape(
     outputs: Float[Tensor, " P"],
     batch: int,
     steps: int = DEFAULT_STEPS,
+    tolerance: float = ORIENTATION_TOLERANCE,
 ) -> Equilibrium:
     """The forward solve: the shape of `batch` samples under known loads and tensions, and the wrench at their base.
 
     Marches tip to base and turns the tip until the base sits in its clamp, R(0) = I: at once without base-frame loads, by damped
-    Newton on three numbers with them. Loads (B, ...) in their own frames and units (torchrod.loads), tension N, outputs m.
+    Newton on three numbers with them, until the base misses it by less than the tolerance (rad). Loads (B, ...) in their own frames
+    and units (torchrod.loads), tension N, outputs m.
     Errors: none raised for numbers; a sample that cannot be solved has status NOT_CONVERGED, one that holds NaN INVALID.
     Source: DESIGN.md section 2.
     """
@@ -247,10 +250,10 @@ def solve_shape(
             # A sample that carries its whole load is left alone, so that what its neighbours still need does not touch it.
             mine = k <= increments
             fraction = torch.where(k >= increments, one, k / increments.to(one.dtype))
-            turned_further, missed, more = _newton(problem, q, fraction, mine)
+            turned_further, missed, more = _newton(problem, q, fraction, mine, tolerance)
             q = torch.where(mine.unsqueeze(-1), turned_further, q)
             residual, iterations = torch.where(mine, missed, residual), iterations + more
-    return _equilibrium(problem, q, residual, iterations, outputs)
+    return _equilibrium(problem, q, residual, iterations, outputs, tolerance)
 
 
 def _equilibrium(
@@ -259,6 +262,7 @@ def _equilibrium(
     residual: Float[Tensor, " B"],
     iterations: Int[Tensor, " B"],
     outputs: Float[Tensor, " P"],
+    tolerance: float,
 ) -> Equilibrium:
     at = problem.grid.outputs_and_base
     states, _ = problem.march(q_tip, q_tip.new_zeros(len(q_tip), 4, 0), torch.ones_like(residual), at)
@@ -272,7 +276,7 @@ def _equilibrium(
     balanced = strains_settled(
         problem.section.K_se, problem.section.K_bt, problem.section.e3, at_base.u_star, n0, m0, at_base.tendons
     )
-    solved = finite & balanced & (residual <= 10 * ORIENTATION_TOLERANCE)
+    solved = finite & balanced & (residual <= 10 * tolerance)
     status = torch.full_like(iterations, int(Status.NOT_CONVERGED))
     status = torch.where(solved, int(Status.CONVERGED), torch.where(finite, status, int(Status.INVALID)))
     keep = solved[:, None, None]
