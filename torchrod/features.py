@@ -52,6 +52,7 @@ class Features:
     """x (B, n): the input. amp (B,): the rms curvature, 1 / L. turn (B, 2, 2): canonical frame = turn @ section frame (orthogonal).
 
     seen (B,): markers that were seen. alpha (B, 6): the base wrench without the unknown load (N, N m), zero where there is none.
+    q_tip (B, 4): the orientation of the tip as the markers have it, to find the base wrench under a guessed load sooner.
     """
 
     x: Float[Tensor, "B n"]
@@ -59,6 +60,7 @@ class Features:
     turn: Float[Tensor, "B 2 2"]
     seen: Float[Tensor, " B"]
     alpha: Float[Tensor, "B 6"]
+    q_tip: Float[Tensor, "B 4"]
 
     def take(self, index: Int[Tensor, " b"]) -> "Features":
         """The samples of an index."""
@@ -105,11 +107,18 @@ def _canonical(bend: Float[Tensor, "B G 2"], amp: Float[Tensor, " B"]) -> Float[
     return torch.stack([e, sign.unsqueeze(-1) * across], 1)
 
 
+def _facing(way: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4"]:
+    """The smallest rotation that turns e3 to a direction: the quaternion (e3 x t, 1 + e3 . t), normalized."""
+    t = torch.nn.functional.normalize(way, dim=-1)
+    q = torch.stack([-t[:, 1], t[:, 0], torch.zeros_like(t[:, 0]), (1 + t[:, 2]).clamp(min=1e-3)], -1)
+    return torch.nn.functional.normalize(q, dim=-1)
+
+
 def features(model: Model, markers: Markers, noise: float) -> Features:
     """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod; one forward solve serves all."""
     L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
     stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
-    places = torch.cat([markers.s, stations])
+    places = torch.cat([markers.s, stations, torch.linspace(L / GRID, L, GRID, dtype=DTYPE)])
     rest = solve_shape(model.robot, (), markers.tension, places, len(seen), model.steps, ROUGH_TOLERANCE)
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
     p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
@@ -127,8 +136,9 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
     if is_active(model.robot):
         pull, moment, weight = _known(model.robot, markers, stations)
         moment = turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1)
-        parts += [pull, moment, turned(weight), turned(p0[:, P:] / L)]
-    return Features(torch.cat(parts, -1), amp, turn, count, rest.base_wrench.nan_to_num(0.0))
+        parts += [pull, moment, turned(weight), turned(p0[:, P : P + STATIONS] / L)]
+    q_tip = _facing((p0[:, -1] + L * y[:, -1]) - (p0[:, -2] + L * y[:, -2]))
+    return Features(torch.cat(parts, -1), amp, turn, count, rest.base_wrench.nan_to_num(0.0), q_tip)
 
 
 def prior_log_c(model: Model) -> float:

@@ -29,9 +29,15 @@ class Start:
 StartRule = Callable[[Model, Markers, float], Start]
 
 
-def equilibrium_wrench(model: Model, loads: tuple[Load, ...], markers: Markers) -> Float[Tensor, "B 6"]:
-    """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found."""
-    shape = solve_shape(model.robot, loads, markers.tension, markers.s[-1:], len(markers.positions), model.steps, ROUGH_TOLERANCE)
+def equilibrium_wrench(
+    model: Model, loads: tuple[Load, ...], markers: Markers, q_tip: Float[Tensor, "B 4"] | None = None
+) -> Float[Tensor, "B 6"]:
+    """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found.
+
+    q_tip: the orientation of the tip near which to look, where it is known: much sooner found (torchrod.solve_shape).
+    """
+    B, s = len(markers.positions), markers.s[-1:]
+    shape = solve_shape(model.robot, loads, markers.tension, s, B, model.steps, ROUGH_TOLERANCE, q_tip)
     return shape.base_wrench.nan_to_num(0.0)
 
 

@@ -221,12 +221,13 @@ def solve_shape(
     batch: int,
     steps: int = DEFAULT_STEPS,
     tolerance: float = ORIENTATION_TOLERANCE,
+    q_tip: Float[Tensor, "B 4"] | None = None,
 ) -> Equilibrium:
     """The forward solve: the shape of `batch` samples under known loads and tensions, and the wrench at their base.
 
     Marches tip to base and turns the tip until the base sits in its clamp, R(0) = I: at once without base-frame loads, by damped
     Newton on three numbers with them, until the base misses it by less than the tolerance (rad). Loads (B, ...) in their own frames
-    and units (torchrod.loads), tension N, outputs m.
+    and units (torchrod.loads), tension N, outputs m. q_tip: where to look for the tip's orientation, with all of the load at once.
     Errors: none raised for numbers; a sample that cannot be solved has status NOT_CONVERGED, one that holds NaN INVALID.
     Source: DESIGN.md section 2.
     """
@@ -241,11 +242,14 @@ def solve_shape(
     problem = _TipProblem(section, table, grid, torch.cat([N, M if beyond.Gm is None else M + beyond.Gm], -1))
 
     q, one = identity_quaternion((batch,), zero), torch.ones_like(zero[:, 0])
-    r, _ = problem.base(q, zero.new_zeros(batch, 4, 0), 0 * one)
-    q = turned(-r, q)  # exact where no load keeps its direction in the base frame
+    dead = table.loads.Wn is not None or table.loads.Wm is not None
+    if q_tip is None or not dead:
+        r, _ = problem.base(q, zero.new_zeros(batch, 4, 0), 0 * one)
+        q = turned(-r, q)  # exact where no load keeps its direction in the base frame
     residual, iterations = 0 * one, torch.zeros(batch, dtype=torch.int64)
-    if table.loads.Wn is not None or table.loads.Wm is not None:
-        increments = _increments(robot, table, batch)
+    if dead:
+        increments = _increments(robot, table, batch) if q_tip is None else torch.ones(batch, dtype=torch.int64)
+        q = q if q_tip is None else q_tip
         for k in range(1, int(increments.max()) + 1):
             # A sample that carries its whole load is left alone, so that what its neighbours still need does not touch it.
             mine = k <= increments

@@ -84,7 +84,7 @@ class WarmStart:
         part = read.take(index)
         prediction, turn = self.predict(model, part), turn_of_gamma(part.turn, size // PER_LOAD)
         gamma = (turn.mT @ prediction.gamma.unsqueeze(-1)).squeeze(-1)
-        alpha = equilibrium_wrench(model, model.coordinates.loads(gamma), markers.take(index))
+        alpha = equilibrium_wrench(model, model.coordinates.loads(gamma), markers.take(index), part.q_tip)
         x = cold.index_copy(0, index, model.join(gamma, alpha))
         if not self.predicted_spread:
             return Start(x, None, warm, cold)
