@@ -171,7 +171,7 @@ def _verdict(data: dict[str, Any]) -> list[str]:
 
 def _figure(study: Study2, example: dict[str, tuple[Estimate, Model]], path: Path) -> None:
     """Case 0 with 1 mm noise: true and fitted load carried up to s, both components."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
+    figure = Figure(figsize=(9, 4.3), layout="constrained")
     s = torch.linspace(0, L, 201, dtype=torch.float64).reshape(1, 201, 1).expand(1, 201, 3)
     for axis, label in enumerate("xy"):
         axes = figure.add_subplot(1, 2, axis + 1)
@@ -186,5 +186,5 @@ def _figure(study: Study2, example: dict[str, tuple[Estimate, Model]], path: Pat
         axes.set_xlabel("s (mm)")
         axes.set_ylabel(f"load carried up to s, {label} (N), 1 mm noise")
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=150)
