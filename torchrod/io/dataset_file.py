@@ -9,7 +9,8 @@ from typing import Any
 from ..dataset import DISTRIBUTIONS, FAMILIES, DatasetSpec, Range
 from ..errors import InputError
 from ..robot import Robot
-from .robot_file import _number, _numbers, _table, read_robot
+from .robot_file import read_robot
+from .values import as_number, as_numbers, as_table
 
 KEYS = {
     "dataset": {"samples", "shard_size", "seed", "noise"},
@@ -40,7 +41,7 @@ def _range(where: str, value: object, most: float | None = None, positive: bool 
     """[lowest, highest], not negative."""
     if not isinstance(value, list) or len(value) != 2:
         raise InputError(f"{where} is {value!r}; it must be [lowest, highest], two numbers")
-    low, high = _numbers(where, value, 2)
+    low, high = as_numbers(where, value, 2)
     if low > high:
         raise InputError(f"{where} is {value!r}; the lowest comes first")
     if low < 0 or (positive and low == 0):
@@ -69,7 +70,7 @@ def _loads(where: str, table: dict[str, Any]) -> dict[str, Any]:
     key = _one_of(where, table, "force", "force_scale")
     force = _range(f"{where}.{key}", table[key], positive=distribution == "log-uniform")
     location = _range(f"{where}.location", _needed(where, table, "location", "[lowest, highest] as fractions of the length"), 1.0)
-    gap = _number(f"{where}.min_gap", table.get("min_gap", 0.0), least=0.0)
+    gap = as_number(f"{where}.min_gap", table.get("min_gap", 0.0), least=0.0)
     if (contacts - 1) * gap > location[1] - location[0]:
         raise InputError(f"{where}.min_gap is {gap}: {contacts} contacts do not fit into the range of location; lower one of them")
     if family == "point" and "width" in table:
@@ -94,7 +95,7 @@ def _markers(where: str, table: dict[str, Any]) -> tuple[float, ...]:
     at = table["at"]
     if not isinstance(at, list) or not at:
         raise InputError(f"{where}.at is {at!r}; it must be a list of fractions of the length")
-    at = _numbers(f"{where}.at", at, len(at))
+    at = as_numbers(f"{where}.at", at, len(at))
     if any(not 0 <= v <= 1 for v in at) or any(b <= a for a, b in pairwise(at)):
         raise InputError(f"{where}.at must increase and lie between 0 (the base) and 1 (the tip)")
     return tuple(at)
@@ -145,11 +146,11 @@ def read_dataset_spec(path: str | Path, samples: int | None = None, seed: int | 
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except ValueError as error:  # not TOML, not UTF-8, or a path that is none
         raise InputError(f"{path}: is not valid TOML ({error})") from None
-    _table(str(path), content, set(KEYS))
+    as_table(str(path), content, set(KEYS))
     for name in REQUIRED:
         if name not in content:
             raise InputError(f"{path}: has no [{name}] table; known keys: {', '.join(sorted(KEYS[name]))}")
-    tables = {name: _table(f"{path}: {name}", content.get(name, {}), known) for name, known in KEYS.items()}
+    tables = {name: as_table(f"{path}: {name}", content.get(name, {}), known) for name, known in KEYS.items()}
     general, where = tables["dataset"], f"{path}: dataset"
     count = _needed(where, general, "samples", "the number of samples, or --samples") if samples is None else samples
     robots = _robots(path, tables["robot"])
@@ -160,7 +161,7 @@ def read_dataset_spec(path: str | Path, samples: int | None = None, seed: int | 
         seed=_integer(
             "--seed" if seed is not None else f"{where}.seed", general.get("seed", 0) if seed is None else seed, 0, 2**63 - 1
         ),
-        noise=_number(f"{where}.noise", general.get("noise", 0.0), least=0.0),
+        noise=as_number(f"{where}.noise", general.get("noise", 0.0), least=0.0),
         markers=_markers(f"{path}: markers", tables["markers"]),
         **_loads(f"{path}: loads", tables["loads"]),
         **_vary(f"{path}: vary", tables["vary"], robots),

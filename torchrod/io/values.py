@@ -1,0 +1,49 @@
+"""Values of TOML files: each is what its key says, or is refused in one sentence with file, key and remedy."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+from ..errors import InputError
+
+
+def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
+    """A table of known keys."""
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be a table of keys; known keys: {', '.join(sorted(known))}")
+    for key in value:
+        if key not in known:
+            raise InputError(f"{where}: unknown key '{key}'; known keys: {', '.join(sorted(known))}")
+    return value
+
+
+def as_number(where: str, value: object, positive: bool = False, least: float = -math.inf) -> float:
+    """A finite number, positive or at least `least` where that is asked for."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"{where} is {value!r}; it must be a number in SI units")
+    try:
+        value = float(value)
+    except OverflowError:
+        value = math.inf
+    if not math.isfinite(value):
+        raise InputError(f"{where} is {value}; it must be finite")
+    if (positive and value <= 0) or value < least:
+        raise InputError(f"{where} is {value}; it must be {'positive' if positive else f'at least {least:g}'}")
+    return value
+
+
+def as_numbers(where: str, value: object, count: int) -> list[float]:
+    """A list of `count` such numbers."""
+    if not isinstance(value, list) or len(value) != count:
+        raise InputError(f"{where} is {value!r}; it must be a list of {count} numbers")
+    return [as_number(where, v) for v in value]
+
+
+def as_rows(where: str, value: object, count: int) -> list[list[float]]:
+    """A table given as a list of rows whose first entry, s, increases."""
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{where} must be a list of rows of {count} numbers, s first")
+    rows = [as_numbers(f"{where}[{i}]", row, count) for i, row in enumerate(value)]
+    if any(b[0] <= a[0] for a, b in pairwise(rows)):
+        raise InputError(f"{where}: s must increase from row to row")
+    return rows
