@@ -30,7 +30,6 @@ LEAST_DRAW = 16  # a further draw for a few missing samples costs no less than t
 JUDGED_AFTER = 64  # draws: fewer say little about how many can be solved
 FAMILIES = ("point", "gaussian")
 DISTRIBUTIONS = ("uniform", "log-uniform")
-FORCE_UNITS = ("N", "EI/L^2")
 Range = tuple[float, float]
 
 # Every array of a shard, in the order of its checksum: shape (n samples, P markers, K contacts, T tendons), unit, frame or meaning.

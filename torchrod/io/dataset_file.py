@@ -1,6 +1,5 @@
 """DATASET.toml: what a data set is to hold. Every refusal is one sentence with file, key and remedy."""
 
-import tomllib
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -10,7 +9,7 @@ from ..dataset import DISTRIBUTIONS, FAMILIES, DatasetSpec, Range
 from ..errors import InputError
 from ..robot import Robot
 from .robot_file import read_robot
-from .values import as_number, as_numbers, as_table
+from .values import as_number, as_numbers, as_table, read_toml
 
 KEYS = {
     "dataset": {"samples", "shard_size", "seed", "noise"},
@@ -140,12 +139,7 @@ def read_dataset_spec(path: str | Path, samples: int | None = None, seed: int | 
     Errors: InputError naming file, key and remedy.
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:  # not TOML, not UTF-8, or a path that is none
-        raise InputError(f"{path}: is not valid TOML ({error})") from None
+    content = read_toml(path)
     as_table(str(path), content, set(KEYS))
     for name in REQUIRED:
         if name not in content:

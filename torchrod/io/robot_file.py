@@ -1,7 +1,6 @@
 """ROBOT.toml: the robot. Every refusal is one sentence with file, key and remedy."""
 
 import math
-import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from ..errors import InputError
 from ..robot import Robot
 from ..rod import DTYPE, Rod
 from ..tendons import Tendon, Tendons
-from .values import as_number, as_numbers, as_rows, as_table
+from .values import as_number, as_numbers, as_rows, as_table, read_toml
 
 TOP_KEYS = {"name", "rod", "tendons"}
 ROD_KEYS = {
@@ -102,12 +101,7 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
 def read_robot(path: str | Path) -> Robot:
     """A robot from ROBOT.toml (docs/files.md). SI units. Errors: InputError naming file, key and remedy."""
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:  # not TOML, not UTF-8, or a path that is none
-        raise InputError(f"{path}: is not valid TOML ({error})") from None
+    content = read_toml(path)
     if "rod" not in content:
         raise InputError(f"{path}: has no [rod] table; give at least length, diameter, youngs_modulus and shear_modulus")
     as_table(str(path), content, TOP_KEYS)

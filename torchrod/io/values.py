@@ -1,10 +1,22 @@
 """Values of TOML files: each is what its key says, or is refused in one sentence with file, key and remedy."""
 
 import math
+import tomllib
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except ValueError as error:  # not TOML, not UTF-8, or a path that is none
+        raise InputError(f"{path}: is not valid TOML ({error})") from None
 
 
 def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
