@@ -154,7 +154,7 @@ def test_information_adds_up(registration):
     location, _ = load_bound(robot, markers, F, where, wrench, 1e-3, registration)
     told = location < 0.4  # what is not on the rod is not located, and round-off is all there is to compare
     assert int(told.sum()) > 60
-    assert float((0.4 * C[:, 2, 2].sqrt() / location - 1)[told].abs().max()) < 1e-9
+    assert float((0.4 * C[:, 2, 2].sqrt() / location - 1)[told].abs().max()) < 1e-7  # round-off, times the condition of A
 
 
 def test_proposed_markers():

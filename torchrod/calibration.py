@@ -15,7 +15,7 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import GaussianCoordinates
-from .estimator import DECREMENT, DECREMENT_SHARE, SETTLED, Settings, check
+from .estimator import Settings, check
 from .grid import DEFAULT_STEPS
 from .measurement import Markers, Model
 from .result import ACCEPT, Z95
@@ -148,6 +148,7 @@ def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, 
     """The filter on theta: the recursion of torchrod.estimator for one state."""
     mean = theta = before = shapes.start()
     Q, Sigma0 = settings.Q * torch.ones_like(theta), torch.diag(settings.Sigma0 * torch.ones_like(theta))[None]
+    limits = ekf.Limits()
     Sigma, kept, retreats, cap = Sigma0, torch.zeros(len(shapes.weights), dtype=torch.bool), 0, torch.full((1,), torch.inf)
     for iteration in range(1, settings.max_iterations + 1):
         trial = shapes.linearize(theta, mean)
@@ -163,14 +164,14 @@ def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, 
                 f"no sample has markers, finite tensions and an equilibrium at {float(theta[0].exp()):.3g} kg/m; check the units "
                 "of tensions and stiffness, or start from another mass_per_length"
             )
-        if bool(at.decrement < (DECREMENT_SHARE * at.cost).clamp(min=DECREMENT)):
+        if bool(at.decrement < (limits.share * at.cost).clamp(min=limits.decrement)):
             return theta, trial, iteration, Status.CONVERGED
         inflated = torch.minimum(ekf.inflation(w, w.shape[-1], at.decrement), cap)
         weights = ekf.adapted_weights(w, w.shape[-1], inflated) if settings.adaptive else w
         A, g = ekf.information(at.H, at.r, weights, theta[None], mean, torch.full_like(theta, PRIOR))
         step, Sigma_next = ekf.update(ekf.predict(Sigma, Q), A, g)
         # Where the adapted shapes has settled but the true one has not, the weights must move on towards the true ones.
-        cap = torch.where((g * step).sum(-1) < SETTLED, 0.1 * inflated, cap)
+        cap = torch.where((g * step).sum(-1) < limits.settled, 0.1 * inflated, cap)
         Sigma = Sigma_next if bool(torch.isfinite(Sigma_next).all()) else Sigma0
         before, kept, retreats = theta, solved, 0
         theta = shapes.stopped_at_kinks(theta, ekf.limited(step, settings.step_limit)[0])

@@ -9,17 +9,19 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import PaperCoordinates
+from .fast import Sums
 from .measurement import Markers, Model
+from .prepared import Prepared, served
 from .result import Estimate, make_estimate
 from .rod import DTYPE
-from .starts import Start, StartRule, better_start, cold_start, equilibrium_wrench, residual_and_cost
+from .starts import Start, StartRule, better_start, cold_start, equilibrium_wrench
 from .status import Learned, Status
 
-CHUNK = 256  # samples per pass: the working set of one iteration stays in cache
-DECREMENT = 1e-3  # converged: a further step promises to lower the cost (chi^2) by less than this,
-DECREMENT_SHARE = 1e-6  # or by less than this share of it: a model that cannot explain the data need not be fitted to round-off
+CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
+CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
+COARSE_STEPS = 20  # along the rod, as long as the fit is far from the data: within 1e-6 m of the exact shape
+NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
-SETTLED = 1.0  # the cost with adapted weights is at its minimum when a step promises less than this
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class Settings:
     """How the filter is run. Sigma0, Q: the variances (per entry of x) it starts from and adds at every iteration (4).
 
     step_limit: the largest change of any entry in one iteration. adaptive: residual-adaptive noise.
+    coarse: begin with COARSE_STEPS steps along the rod and end, where the fit is near, with the model's own.
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
@@ -36,6 +39,7 @@ class Settings:
     Q: float | Float[Tensor, " n"] = 1.0
     step_limit: float = 0.6
     adaptive: bool = True
+    coarse: bool = True
     max_iterations: int = 100
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
 
@@ -53,7 +57,7 @@ def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Setting
     assert isinstance(model.coordinates, PaperCoordinates)
     size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
     size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
-    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, 500, ())
+    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, False, 500, ())
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,10 @@ class Linearized:
 def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[Tensor, "B z"]) -> Linearized:
     """r = z - h(x) (zero where a marker is missing), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
     h, H = model.linearized(x, markers)
-    r, cost = residual_and_cost(model, markers, w, x, h)
+    r = Prepared(model, markers, w).residual(h)
     A, g = ekf.information(H, r, w, x, *model.prior())
+    mean, precision = model.prior()
+    cost = (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
     return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
 
 
@@ -92,44 +98,37 @@ def _filter(
     model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
 ) -> Estimate:
     """Iterate one chunk. Samples leave the batch when they have converged; a failed one never touches its neighbours."""
-    w = model.weights(markers, noise)
-    x, before = start.x.clone(), start.x.clone()
+    prepared = Prepared(model, markers, model.weights(markers, noise))
+    x = start.x.clone()
     Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
-    Sigma, Q = Sigma0.clone(), settings.Q * x.new_ones(model.size)
-    mean, precision = model.prior()
-    B = len(x)
+    Sigma0, Q = Sigma0.contiguous(), settings.Q * x.new_ones(model.size)
+    cap = x.new_full((len(x),), torch.inf if settings.adaptive else 0.0)
+    at = ekf.Iterate(x, Sigma0.clone(), x.clone(), cap, torch.zeros(len(x), dtype=torch.bool))
     ok = usable(model, markers)
     status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
-    iterations = torch.zeros(B, dtype=torch.int64)
-    cap, P3 = x.new_full((B,), torch.inf if settings.adaptive else 0.0), 3 * len(markers.s)
-    live = ok.nonzero().squeeze(-1)
-    for _ in range(settings.max_iterations):
+    iterations, live = torch.zeros(len(x), dtype=torch.int64), ok.nonzero().squeeze(-1)
+    sums = Sums.room(len(x), model.size, len(markers.s))
+    limits = ekf.Limits(step=settings.step_limit)
+    coarse = replace(prepared, model=replace(model, steps=min(model.steps, COARSE_STEPS)))
+    near = torch.full((len(x),), not settings.coarse or model.steps <= COARSE_STEPS)
+    for iteration in range(settings.max_iterations):
         if not len(live):
             break
-        here, wl = markers.take(live), w[live]
-        at = linearize(model, x[live], here, wl)
         iterations[live] += 1
-        finite = torch.isfinite(at.cost) & torch.isfinite(at.A).flatten(1).all(-1)
-        done = (at.decrement < (DECREMENT_SHARE * at.cost).clamp(min=DECREMENT)) & finite
-        status[live[done]] = int(Status.CONVERGED)
-
-        inflated = torch.minimum(ekf.inflation(wl, P3, at.decrement), cap[live])
-        A, g = ekf.information(at.H, at.r, ekf.adapted_weights(wl, P3, inflated), x[live], mean, precision)
-        step, Sigma_next = ekf.update(ekf.predict(Sigma[live], Q), A, g)
-        # Where the adapted problem has settled but the true one has not, the weights must move on towards the true ones.
-        settled = (g * step).sum(-1) < SETTLED
-        cap[live] = torch.where(settled, 0.1 * inflated, cap[live])
-        fresh = torch.isfinite(Sigma_next).flatten(1).all(-1) & finite
-        onward = x[live] + ekf.limited(step, settings.step_limit)
-        # A model that overflowed says nothing: go half way back to the last place where it did.
-        onward = torch.where(finite.unsqueeze(-1), onward, 0.5 * (x[live] + before[live]))
-        before[live] = torch.where(finite.unsqueeze(-1), x[live], before[live])
-        x[live] = torch.where(done.unsqueeze(-1), x[live], onward)
-        Sigma[live] = torch.where(fresh[:, None, None], Sigma_next, Sigma0[live])
-        progress(int(done.sum()))
-        live = live[~done]
+        far, close = live[~near[live]], live[near[live]]
+        if len(far):
+            near[far] = coarse.iterate(at, far, Sigma0, Q, limits._replace(decrement=NEAR, hold=False), sums)
+            near[far] |= 2 * iteration >= settings.max_iterations
+        if len(close):
+            done = prepared.iterate(at, close, Sigma0, Q, limits, sums)
+            status[close[done]] = int(Status.CONVERGED)
+            progress(int(done.sum()))
+            live = torch.cat([far, close[~done]]).sort().values
     progress(len(live) + int((~ok).sum()))
-    return make_estimate(model, markers, w, x, linearize(model, x, markers, w), status, iterations, start.warm)
+    rest = (status != int(Status.CONVERGED)).nonzero().squeeze(-1)
+    if len(rest):
+        sums.put(rest, prepared.take(rest).sums(at.x[rest]))
+    return make_estimate(prepared, at.x, sums, status, iterations, start.warm)
 
 
 def _from_guess(
@@ -185,8 +184,9 @@ def estimate(
     """
     check(model, markers, noise)
     parts = []
-    for first in range(0, len(markers.positions), CHUNK):
-        index = torch.arange(first, min(first + CHUNK, len(markers.positions)))
+    size = CHUNK if served(model, markers.positions) else CHUNK_TORCH
+    for first in range(0, len(markers.positions), size):
+        index = torch.arange(first, min(first + size, len(markers.positions)))
         part = markers.take(index)
         parts.append(_with_restarts(model, part, noise, settings or Settings(), start(model, part, noise), progress))
     return Estimate.cat(parts)

@@ -38,7 +38,7 @@ def states_at(states: Float[Tensor, "... S1 c"], at: Int[Tensor, "... P"]) -> Fl
 def compiled(section: Section, y: State) -> bool:
     """Whether the kernel serves this march: one section for the whole batch, float64 on the CPU, and a compiler."""
     plain = section.K_se.ndim == 2 and section.K_bt.ndim == 2
-    return plain and y.dtype == torch.float64 and y.device.type == "cpu" and fast.library() is not None
+    return plain and y.dtype == torch.float64 and y.device.type == "cpu" and fast.available()
 
 
 def march_linearized(

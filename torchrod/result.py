@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,13 +10,12 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import LoadReport
+from .fast import Sums
 from .jacobian import forward_jacobian
 from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
-from .measurement import Markers, Model
+from .measurement import TIP_EXACT, Model
+from .prepared import Prepared
 from .status import Learned, Status
-
-if TYPE_CHECKING:
-    from .estimator import Linearized
 
 Z95 = 1.959964  # of the standard normal distribution
 ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
@@ -227,17 +225,18 @@ def tip_covariance(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Te
 
 
 def make_estimate(
-    model: Model,
-    markers: Markers,
-    w: Float[Tensor, "B z"],
+    prepared: Prepared,
     x: Float[Tensor, "B n"],
-    at: "Linearized",
+    sums: Sums,
     status: Int[Tensor, " B"],
     iterations: Int[Tensor, " B"],
     warm_started: Bool[Tensor, " B"],
 ) -> Estimate:
-    """Assemble the result from the last linearization; a sample that is invalid holds NaN throughout."""
-    valid = (status != int(Status.INVALID)) & torch.isfinite(at.cost)
+    """Assemble the result from the sums at x; a sample that is invalid holds NaN throughout."""
+    model, markers = prepared.model, prepared.markers
+    normal = prepared.normal(sums)
+    _, _, cost = normal.whole(x, *model.prior())
+    valid = (status != int(Status.INVALID)) & torch.isfinite(cost)
     status = torch.where(valid, status, int(Status.INVALID))
 
     def kept(value: Tensor) -> Tensor:
@@ -249,11 +248,11 @@ def make_estimate(
 
     gamma, zeta, alpha = model.split(x)
     report: LoadReport = model.coordinates.describe(gamma)
-    covariance = ekf.posterior(ekf.information(at.H, at.r, model.exact_weights(w), x, *model.prior())[0])
+    covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *model.prior())[0])
     present = markers.present
     dof = 3 * present.sum(-1) + 6 + model.coordinates.informative_priors - model.size
     limit = torch.from_numpy(chi2_distribution.ppf(ACCEPT, dof.clamp(min=1).numpy()))
-    residual = at.r[:, :-6].unflatten(-1, (-1, 3))
+    residual = sums.r[:, :-6].unflatten(-1, (-1, 3))
     return Estimate(
         x=kept(x),
         covariance=settled(covariance),
@@ -266,11 +265,11 @@ def make_estimate(
         tip_covariance=None if model.tip == "none" else settled(tip_covariance(model, covariance)),
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
-        centre_line=kept(model.shape(x, markers, differentiable=False).p),
+        centre_line=kept(sums.line),
         residual=torch.where(present.unsqueeze(-1), kept(residual), torch.nan),
-        chi2=kept(at.cost),
+        chi2=kept(cost),
         dof=dof,
-        accepted=(at.cost < limit) & (status == int(Status.CONVERGED)),
+        accepted=(cost < limit) & (status == int(Status.CONVERGED)),
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,

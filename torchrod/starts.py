@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .loads import Load
 from .measurement import Markers, Model
+from .prepared import Prepared
 from .statics import ROUGH_TOLERANCE, solve_shape
 
 
@@ -52,16 +53,6 @@ def cold_from(model: Model, alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]
     return model.join(model.coordinates.start().expand(len(alpha), -1), alpha)
 
 
-def residual_and_cost(
-    model: Model, markers: Markers, w: Float[Tensor, "B z"], x: Float[Tensor, "B n"], h: Float[Tensor, "B z"]
-) -> tuple[Float[Tensor, "B z"], Float[Tensor, " B"]]:
-    """r = z - h(x), zero where a marker is missing, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
-    z = torch.cat([markers.positions.flatten(1), h.new_zeros(len(h), 6)], -1)
-    r = torch.where(w > 0, z - h, 0.0)
-    mean, precision = model.prior()
-    return r, (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
-
-
 def better_start(
     model: Model, markers: Markers, noise: float, start: Start, Sigma0: Float[Tensor, "n n"]
 ) -> tuple[Start, Bool[Tensor, " B"]]:
@@ -74,14 +65,10 @@ def better_start(
     if not len(index):
         return start, start.warm
     part = markers.take(index)
-    w = model.weights(part, noise)
+    prepared = Prepared(model, part, model.weights(part, noise))
     cold = cold_start(model, part, noise).x if start.cold is None else start.cold[index]
 
-    def cost(x: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        value = residual_and_cost(model, part, w, x, model.h(x, part, differentiable=False))[1]
-        return value.nan_to_num(torch.inf)
-
-    worse = ~(cost(start.x[index]) < cost(cold))
+    worse = ~(prepared.cost(start.x[index]).nan_to_num(torch.inf) < prepared.cost(cold).nan_to_num(torch.inf))
     dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
     x = start.x.clone()
     x[dropped] = cold[worse]

@@ -1,0 +1,203 @@
+"""The compiled fit against the torch model, which is the definition: h, H, normal equations, the filter's iteration, whole fits.
+
+Whoever changes the torch step, a load family, the measurement or the filter without torchrod/fast fails here.
+"""
+
+import math
+
+import pytest
+import torch
+
+from tests.robots import T, busy_robot, steel_rod
+from tests.test_fast import TENSION, needs_compiler, stiffened
+from torchrod import (
+    FourierCoordinates,
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PaperCoordinates,
+    PointCoordinates,
+    PointForces,
+    Robot,
+    Settings,
+    cold_start,
+    ekf,
+    estimate,
+    fast,
+    forward_jacobian,
+    solve_shape,
+)
+from torchrod.lie import move
+from torchrod.prepared import Prepared
+from torchrod.tendons import Tendon, Tendons
+
+pytestmark = needs_compiler
+B = 5
+
+
+def hanging() -> Robot:
+    """Gravity and two straight tendons, one of which ends half way."""
+    tendons = Tendons((Tendon.straight(0.008, 0.0, 0.4), Tendon.straight(-0.003, 0.007, 0.21)))
+    return Robot(steel_rod().rod, tendons, T([2.0, -3.0, 9.0]) * 0.02 / 0.01)
+
+
+ROBOTS = {"passive": steel_rod, "helical tendons and gravity": busy_robot, "full stiffness": stiffened, "straight tendons": hanging}
+FAMILIES = {
+    "no load": lambda f: GaussianCoordinates(0, 0.4, f),
+    "one gaussian": lambda f: GaussianCoordinates(1, 0.4, f),
+    "three gaussians": lambda f: GaussianCoordinates(3, 0.4, f, "distributed"),
+    "gaussians at known places": lambda f: GaussianCoordinates(2, 0.4, f, locations=(0.1, 0.3)),
+    "the paper's": lambda _: PaperCoordinates(2, 0.4),
+    "fourier": lambda f: FourierCoordinates(2, 0.4, f),
+    "points at known places": lambda f: PointCoordinates(2, 0.4, f, (0.13, 0.3)),
+    "points": lambda f: PointCoordinates(2, 0.4, f),
+}
+
+
+def close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-10) -> bool:
+    return bool((a - b).abs().max() <= relative * b.abs().max())
+
+
+def case(robot: Robot, coordinates, registration: bool, tip: str) -> tuple[Model, Markers, torch.Tensor]:
+    """A model somewhere, with markers on stalks one of which is missing."""
+    model = Model(robot, coordinates, registration, steps=10, tip=tip)
+    generator = torch.Generator().manual_seed(1)
+    positions = 0.1 * torch.randn(B, 3, 3, generator=generator)
+    positions[1, 1] = torch.nan
+    tension = TENSION[torch.tensor([0, 1, 2, 0, 1]), : len(robot.tendons)] if len(robot.tendons) else None
+    x = model.join(coordinates.start().expand(B, -1), torch.zeros(B, 6))
+    size = torch.where(x.abs() > 100, 0.1 * x.abs(), 1.0)
+    x = x + 0.3 * size * torch.randn(B, model.size, generator=generator)
+    return model, Markers(T([0.1, 0.25, 0.4]), positions, 0.01 * torch.eye(3), tension), x
+
+
+@pytest.mark.parametrize(
+    "frame", [(False, "none"), (True, "wrench"), (True, "force")], ids=["", "zeta, tip wrench", "zeta, tip force"]
+)
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_h_jacobian_and_normal_equations(robot, family, frame):
+    r = ROBOTS[robot]()
+    model, markers, x = case(r, FAMILIES[family](r.rod.force_scale), *frame)
+    prepared = Prepared(model, markers, model.weights(markers, 1e-3), nu=4.0)
+    if family == "points" and robot in ("helical tendons and gravity", "full stiffness"):
+        assert not prepared.compiled  # nodes that move under a curvature or a routing that varies: left to torch
+        return
+    assert prepared.compiled
+    h, H = forward_jacobian(lambda x: model.h(x, markers), x)
+    tables = prepared.tables(x)
+    found = fast.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
+    assert close(found[0], h)
+    assert close(found[1], H)
+    assert close(prepared.h(x), h)
+    assert close(found[2], model.shape(x, markers).p)
+    expected, sums = ekf.normal_equations(H, prepared.residual(h), prepared.w, 4.0), prepared.sums(x)
+    for name in ("A", "g", "cost"):
+        assert close(getattr(sums, name), getattr(expected, name)), name
+    assert close(sums.r, prepared.residual(h))
+
+
+@pytest.mark.parametrize("hold", [True, False])
+def test_one_iteration_of_the_filter(hold):
+    """fast.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
+    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
+    prepared = Prepared(model, markers, model.weights(markers, 0.1))
+    fitted = estimate(model, markers, 0.1).x
+    x[0], x[3, 0] = fitted[0], torch.nan
+    sums = fast.Sums.room(B, model.size, 3)
+    Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
+    start = ekf.Iterate(
+        x.clone(), 0.2 * Sigma0, 0.9 * x.nan_to_num(1.0), T([9.0, 0.1, torch.inf, 1.0, 2.0]), torch.zeros(B, dtype=torch.bool)
+    )
+    limits = ekf.Limits(hold=hold)
+    expected = ekf.advance(start, prepared.normal(prepared.sums(x)), Sigma0, model.prior(), Q, limits)
+    live = torch.tensor([0, 1, 3, 4])
+    after = ekf.Iterate(*(getattr(start, k).clone() for k in ("x", "Sigma", "before", "cap", "done")))
+    prepared.iterate(after, live, Sigma0, Q, limits, sums)
+    for name in ("x", "Sigma", "before", "cap"):
+        a, b = getattr(after, name), getattr(expected, name)
+        assert torch.allclose(a[live], b[live], rtol=1e-7, atol=1e-9, equal_nan=True), name
+        assert torch.equal(a[2], getattr(start, name)[2]), name
+    assert torch.equal(after.done[live], expected.done[live])
+    assert after.done[0]
+    assert torch.isfinite(sums.A[0]).all()
+    assert torch.isnan(sums.A[1]).all()
+
+
+def test_gradients_and_transforms_go_through_the_operator():
+    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), True, "none")
+    tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
+    index = torch.arange(B)
+    h, H = model.linearized(x, markers)
+
+    def measured(x):
+        return fast.measured(x, index, tables)
+
+    assert close(measured(x), h)
+    dx, dh = torch.randn_like(x), torch.randn_like(h)
+    assert close(torch.func.jvp(measured, (x,), (dx,))[1], (H @ dx.unsqueeze(-1)).squeeze(-1))
+    assert close(torch.func.vjp(measured, x)[1](dh)[0], (H.mT @ dh.unsqueeze(-1)).squeeze(-1))
+    leaf = x.clone().requires_grad_()
+    (measured(leaf) * dh).sum().backward()
+    assert leaf.grad is not None
+    assert close(leaf.grad, (H.mT @ dh.unsqueeze(-1)).squeeze(-1))
+    assert close(torch.func.vmap(measured)(torch.stack([x, 0.9 * x]))[1], measured(0.9 * x))
+    _, J = forward_jacobian(measured, x)
+    assert close(J, H)
+    arguments = (x, index, True, tables.tensors, tables.counts, tables.numbers)
+    torch.library.opcheck(fast.measure, arguments, test_utils=("test_schema", "test_faketensor", "test_autograd_registration"))
+    torch.library.opcheck(fast.normal_equations, (x, *arguments[3:]), test_utils=("test_schema", "test_faketensor"))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_torch_compile_goes_through_the_operator():
+    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
+    tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
+
+    def cost(x):
+        h, H, _ = fast.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
+        return (h * h).sum(-1) + (H * H).sum((-1, -2))
+
+    compiled = torch.compile(cost, backend="aot_eager", fullgraph=True)
+    assert close(compiled(x), cost(x))
+
+
+def fits(model: Model, markers: Markers, settings: Settings | None = None):
+    return estimate(model, markers, 1e-3, settings, cold_start)
+
+
+@pytest.mark.parametrize("kind", ["one contact", "two contacts", "tendons", "registration", "points"])
+def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
+    """Loads to 1e-8 relative, status and iterations the same."""
+    robot, s = (busy_robot() if kind == "tendons" else steel_rod()), torch.linspace(0.05, 0.4, 8)
+    n = 2 if kind == "two contacts" else 1
+    force = T([[[0.6, 0.3, 0.0], [-0.2, 0.9, 0.0]], [[0.1, -0.8, 0.0], [0.5, 0.5, 0.0]], [[0.4, 0.1, 0.0], [0.3, -0.7, 0.0]]])[
+        :, :n
+    ]
+    at = T([[0.2, 0.35], [0.3, 0.15], [0.25, 0.38]])[:, :n]
+    tension = TENSION if len(robot.tendons) else None
+    p = solve_shape(robot, (PointForces(force, at),), tension, s, 3).p
+    if kind == "registration":
+        p = move(T([[0.005, -0.002, 0.003, 0.05, -0.02, 0.03]]), p)
+    p = p + 1e-3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(3))
+    points = kind == "points"
+    coordinates = PointCoordinates(n, 0.4, 1.0) if points else GaussianCoordinates(n, 0.4, 1.0)
+    model, markers = Model(robot, coordinates, kind == "registration", steps=20), Markers(s, p, None, tension)
+    compiled = fits(model, markers)
+    monkeypatch.setattr(fast, "available", lambda: False)
+    plain = fits(model, markers)
+    assert torch.equal(compiled.status, plain.status)
+    assert torch.equal(compiled.iterations, plain.iterations)
+    assert close(compiled.force, plain.force, 1e-8)
+    assert close(compiled.location, plain.location, 1e-8)
+    assert close(compiled.magnitude_std, plain.magnitude_std, 1e-5)  # round-off, times the condition of A
+
+
+def test_students_t_is_what_the_paper_on_it_says():
+    """Weight and cost against the density: -2 log p = (nu + 3) log(1 + s / nu) + constant, and its derivative."""
+    s = torch.linspace(0.1, 50, 7)
+    cost, factor = ekf.student(s, 4.0)
+    assert torch.allclose(cost, 7 * torch.log1p(s / 4))
+    slope = forward_jacobian(lambda s: ekf.student(s, 4.0)[0], s.unsqueeze(-1))[1][:, 0, 0]
+    assert torch.allclose(factor, slope)
+    assert ekf.student(s, math.inf)[0] is s

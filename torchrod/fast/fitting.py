@@ -1,0 +1,219 @@
+"""The fit by the compiled kernel, as operators of torch: h and H, the normal equations, and one iteration of the filter.
+
+The operators are known to torch (torch.library) with a shape-only stand-in each, so torch.compile and exporting go through them;
+torchrod::measure has a derivative, dh = H dx, and a batching rule, so that gradients and every transform of torch.func go
+through it: `measured`.
+"""
+
+import ctypes
+import time
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .build import library
+from .structures import Filter, Fit, fill, threads
+from .structures import Sums as CSums
+
+FAMILIES = {"none": 0, "gaussian": 1, "paper": 2, "point": 3, "linear": 4}
+
+# What an operator is handed, in this order: tensors (empty where there is none), integers and numbers.
+_SECTION = ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")
+_ALONG = ("h", "Gm", "Wn", "Wm", "u_star", "L", "dr", "tau", "at", "locations", "basis", "s", "inside", "node")
+TENSORS = (*_SECTION, *_ALONG, "offsets", "active", "weight", "positions", "w")
+COUNTS = (
+    *("steps", "tendons", "newton", "diagonal", "outputs"),
+    *("family", "count", "per_load", "gamma", "size", "tip", "tensions", "registration"),
+)
+NUMBERS = ("length", "force_scale", "force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "robust")
+_spent = [0.0]
+
+
+def seconds() -> float:
+    """How long this process has spent in the fit's operators so far."""
+    return _spent[0]
+
+
+@dataclass(frozen=True)
+class FitTables:
+    """All that the fit of a chunk knows beforehand: the tensors of TENSORS, the integers of COUNTS, the numbers of NUMBERS."""
+
+    tensors: list[Tensor]
+    counts: list[int]
+    numbers: list[float]
+
+    @classmethod
+    def of(cls, tensors: dict[str, Tensor | None], counts: dict[str, int], numbers: dict[str, float]) -> "FitTables":
+        """From names."""
+        none = torch.empty(0, dtype=torch.float64)
+        found = [none if (x := tensors.get(name)) is None else x.contiguous() for name in TENSORS]
+        return cls(found, [counts[name] for name in COUNTS], [numbers[name] for name in NUMBERS])
+
+    @cached_property
+    def structure(self) -> Fit:
+        """struct Fit, which points into the tensors."""
+        return _structure(self.tensors, self.counts, self.numbers)
+
+    @property
+    def markers(self) -> int:
+        """P."""
+        return _outputs(self.counts)
+
+
+def _structure(tensors: list[Tensor], counts: list[int], numbers: list[float]) -> Fit:
+    named = {name: x if x.numel() else None for name, x in zip(TENSORS, tensors, strict=True)}
+    values: dict[str, float | int] = dict(zip(COUNTS, counts, strict=True)) | dict(zip(NUMBERS, numbers, strict=True))
+    fit = Fit()
+    fill(fit, named, values)
+    fit.loads.size = counts[COUNTS.index("gamma")]  # which has the same name within its own structure as x has in the whole
+    return fit
+
+
+def _run(function: str, samples: int, *arguments: object) -> None:
+    """Call the library, on as many threads as the samples are worth, and count the time."""
+    lib = library(wait=True)
+    assert lib is not None
+    begun = time.perf_counter()
+    getattr(lib, function)(*arguments, ctypes.c_int64(threads(samples, lib.torchrod_lanes())))
+    _spent[0] += time.perf_counter() - begun
+
+
+def _at(x: Tensor) -> ctypes.c_void_p:
+    return ctypes.c_void_p(x.data_ptr())
+
+
+def _outputs(counts: list[int]) -> int:
+    """P."""
+    return counts[COUNTS.index("outputs")] - 1
+
+
+@torch.library.custom_op("torchrod::measure", mutates_args=(), device_types="cpu")
+def measure(
+    x: Tensor, index: Tensor, slopes: bool, tensors: list[Tensor], counts: list[int], numbers: list[float]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """h (b, 3 P + 6), H (b, 3 P + 6, n) (without `slopes`: n = 0), centre line (b, P, 3): of samples `index` at x (b, n)."""
+    b, n, P = len(x), x.shape[-1], _outputs(counts)
+    h, line = x.new_empty(b, 3 * P + 6), x.new_empty(b, P, 3)
+    H = x.new_empty(b, 3 * P + 6, n if slopes else 0)
+    fit, x, index = _structure(tensors, counts, numbers), x.contiguous(), index.contiguous()
+    address = _at(H) if slopes else ctypes.c_void_p(None)
+    _run("torchrod_measure", b, ctypes.byref(fit), _at(x), _at(index), ctypes.c_int64(b), _at(h), address, _at(line))
+    return h, H, line
+
+
+@measure.register_fake
+def _(x, index, slopes, tensors, counts, numbers):
+    b, n, P = x.shape[0], x.shape[1], _outputs(counts)
+    return x.new_empty(b, 3 * P + 6), x.new_empty(b, 3 * P + 6, n if slopes else 0), x.new_empty(b, P, 3)
+
+
+@measure.register_vmap
+def _(info, in_dims, x, index, slopes, tensors, counts, numbers):
+    """The batch of batches is one batch; what is known along the rod does not differ between them."""
+    many = info.batch_size
+    x = x.movedim(in_dims[0], 0) if in_dims[0] is not None else x.expand(many, *x.shape)
+    index = index.movedim(in_dims[1], 0) if in_dims[1] is not None else index.expand(many, *index.shape)
+    out = measure(x.flatten(0, 1), index.flatten(), slopes, tensors, counts, numbers)
+    return tuple(o.unflatten(0, x.shape[:2]) for o in out), (0, 0, 0)
+
+
+class _Measured(torch.autograd.Function):
+    """h(x) with dh = H dx, in both modes."""
+
+    @staticmethod
+    def forward(x, index, tensors, counts, numbers):  # pyright: ignore[reportIncompatibleMethodOverride]
+        h, H, _ = measure(x, index, True, tensors, counts, numbers)
+        return h, H
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(output[1])
+        ctx.save_for_forward(output[1])
+
+    @staticmethod
+    def backward(ctx, dh, _):  # pyright: ignore[reportIncompatibleMethodOverride]
+        (H,) = ctx.saved_tensors
+        return (H * dh.unsqueeze(-1)).sum(-2), None, None, None, None
+
+    @staticmethod
+    def jvp(ctx, dx, *_):  # pyright: ignore[reportIncompatibleMethodOverride]
+        (H,) = ctx.saved_tensors
+        return (H * dx.unsqueeze(-2)).sum(-1), None
+
+    @staticmethod
+    def vmap(info, in_dims, x, index, tensors, counts, numbers):  # pyright: ignore[reportIncompatibleMethodOverride]
+        x = x.movedim(in_dims[0], 0) if in_dims[0] is not None else x.expand(info.batch_size, *x.shape)
+        index = index.expand(info.batch_size, *index.shape) if in_dims[1] is None else index.movedim(in_dims[1], 0)
+        h, H = _Measured.apply(x.flatten(0, 1), index.flatten(), tensors, counts, numbers)  # pyright: ignore[reportGeneralTypeIssues]
+        return (h.unflatten(0, x.shape[:2]), H.unflatten(0, x.shape[:2])), (0, 0)
+
+
+def measured(x: Float[Tensor, "b n"], index: Int[Tensor, " b"], tables: FitTables) -> Float[Tensor, "b z"]:
+    """h(x) of the samples `index`, once differentiable in x by autograd and by every transform of torch.func."""
+    return _Measured.apply(x, index, tables.tensors, tables.counts, tables.numbers)[0]  # pyright: ignore[reportOptionalSubscript]
+
+
+@torch.library.custom_op("torchrod::normal_equations", mutates_args=(), device_types="cpu")
+def normal_equations(
+    x: Tensor, tensors: list[Tensor], counts: list[int], numbers: list[float]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """H^T W H (B, 2, n, n), H^T W r (B, 2, n) and r^T W r (B, 2) of the markers and of the tip residual; r (B, z); centre line."""
+    B, n, P = len(x), x.shape[-1], _outputs(counts)
+    A, g, cost = x.new_empty(B, 2, n, n), x.new_empty(B, 2, n), x.new_empty(B, 2)
+    r, line = x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
+    fit, sums, x = _structure(tensors, counts, numbers), CSums(), x.contiguous()
+    fill(sums, {"A": A, "g": g, "cost": cost, "r": r, "line": line}, {})
+    _run("torchrod_normal", B, ctypes.byref(fit), _at(x), ctypes.c_int64(B), ctypes.byref(sums))
+    return A, g, cost, r, line
+
+
+@normal_equations.register_fake
+def _(x, tensors, counts, numbers):
+    B, n, P = x.shape[0], x.shape[1], _outputs(counts)
+    return x.new_empty(B, 2, n, n), x.new_empty(B, 2, n), x.new_empty(B, 2), x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What `normal_equations` returns, kept for every sample of a chunk."""
+
+    A: Float[Tensor, "B 2 n n"]
+    g: Float[Tensor, "B 2 n"]
+    cost: Float[Tensor, "B 2"]
+    r: Float[Tensor, "B z"]
+    line: Float[Tensor, "B P 3"]
+
+    @classmethod
+    def room(cls, B: int, n: int, P: int) -> "Sums":
+        """NaN throughout."""
+        sizes = ((B, 2, n, n), (B, 2, n), (B, 2), (B, 3 * P + 6), (B, P, 3))
+        return cls(*(torch.full(size, torch.nan, dtype=torch.float64) for size in sizes))
+
+    def put(self, index: Int[Tensor, " b"], other: "Sums") -> None:
+        """Write the samples of an index, in place."""
+        for name in ("A", "g", "cost", "r", "line"):
+            getattr(self, name)[index] = getattr(other, name)
+
+
+def iterate(
+    tables: FitTables,
+    state: dict[str, Tensor],
+    live: Int[Tensor, " b"],
+    filtering: dict[str, Tensor],
+    limits: dict[str, float | int],
+    sums: Sums,
+) -> None:
+    """One iteration of the filter on the samples `live`, in place: ekf.advance at the normal equations of x.
+
+    state: x, Sigma, before, cap, done of ekf.Iterate. filtering: Sigma0 (B, n, n), mean, precision and Q (n). limits: those of
+    ekf.Limits by name. sums: written for the samples that are done.
+    """
+    call, at, live, b = Filter(), CSums(), live.contiguous(), len(live)
+    fill(call, state | filtering, limits)
+    fill(at, vars(sums), {})
+    pointers = [ctypes.byref(x) for x in (tables.structure, call, at)]
+    _run("torchrod_iterate", b, *pointers, _at(live), ctypes.c_int64(b))

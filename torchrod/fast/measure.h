@@ -1,0 +1,236 @@
+// What the markers show of a rod, and the normal equations: the compiled copy of Model.h, of the loads it is made of, and of
+// starts.residual_and_cost and ekf.normal_equations.
+#pragma once
+
+#include "loads.h"
+
+constexpr int PLAIN = 6;  // rows of the tip residual
+
+struct Fit {
+    Known known;
+    Loads loads;
+    int64_t size, tip, tensions, registration;  // entries of x in all, of the unknown wrench at the tip, of free tensions; flag
+    double force_unit, moment_unit, length_unit, angle_unit, tension_unit;
+    double robust;                  // degrees of freedom of Student's t, infinite for a normal distribution
+    const double *offsets, *active;  // (P, 3) or null; (S, 3, T) or null
+    Table weight;                   // (3) N/m: what hangs per metre, for nodes that move
+    const double *positions, *w;    // (B, P, 3) with NaN where missing; (B, 3 P + 6)
+};
+
+// Rigid motion by zeta = [translation, rotation vector] and how R moves: lie.py, move. R = 1 + a hat(w) + b hat(w)^2.
+struct Motion {
+    V t[3], R[9], dR[3][9];
+    Motion() {}
+    Motion(const V* translation, const V* w) {
+        const V square = w[0] * w[0] + w[1] * w[1] + w[2] * w[2];
+        V a = V{}, b = V{}, da = V{}, db = V{};  // of square, by which they are differentiated
+        for (int i = 0; i < W; i++) coefficients(square[i], a[i], b[i], da[i], db[i]);
+        const V hat[9] = {V{}, -w[2], w[1], w[2], V{}, -w[0], -w[1], w[0], V{}};
+        for (int i = 0; i < 3; i++) {
+            t[i] = translation[i];
+            for (int j = 0; j < 3; j++) {
+                const V twice = w[i] * w[j] - (i == j ? square : V{});
+                R[3 * i + j] = (i == j ? splat(1.0) : V{}) + a * hat[3 * i + j] + b * twice;
+                for (int k = 0; k < 3; k++) {
+                    const double turn = (j - i + 3) % 3 == 1 && k == 3 - i - j ? -1 : (j - i + 3) % 3 == 2 && k == 3 - i - j ? 1 : 0;
+                    V dtwice = (k == i ? w[j] : V{}) + (k == j ? w[i] : V{}) - (i == j ? 2.0 * w[k] : V{});
+                    dR[k][3 * i + j] = 2.0 * w[k] * (da * hat[3 * i + j] + db * twice) + a * turn + b * dtwice;
+                }
+            }
+        }
+    }
+    static void coefficients(double s, double& a, double& b, double& da, double& db) {
+        if (s > 0.5) {
+            const double angle = std::sqrt(s), sine = std::sin(angle), cosine = std::cos(angle);
+            a = sine / angle, b = (1 - cosine) / s;
+            da = (cosine - a) / (2 * s), db = (a - 2 * b) / (2 * s);
+            return;
+        }
+        double term = 1;  // (-s)^k / (2 k)!
+        a = b = da = db = 0;
+        for (int k = 0; k < 12; k++) {
+            const double p = term / (2 * k + 1), q = p / (2 * k + 2);
+            a += p, b += q;
+            if (k) da += k * p, db += k * q;
+            term *= -s / ((2 * k + 1) * (2 * k + 2));
+        }
+        if (s != 0) da /= s, db /= s;
+        else da = -1.0 / 6, db = -1.0 / 24;
+    }
+};
+
+// Room for one group, kept from group to group.
+struct Room {
+    std::vector<V> local, moves, rows, line;
+    std::vector<Balance> balance;
+};
+
+struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the centre line in the rod's own frame
+    V *rows, *line;
+    int64_t width;
+    V& h(int64_t z) const { return rows[z * width]; }
+    V* H(int64_t z) const { return rows + z * width + 1; }
+};
+
+template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, Room& room) {
+    const Known& m = f.known;
+    Group g{&m, lanes, f.loads.size, f.tensions, f.tension_unit, nullptr, nullptr, f.weight, f.active, nullptr};
+    if (m.tendons) room.balance.resize(4 * m.steps), g.balance = room.balance.data();
+    if (f.loads.family == POINT) {
+        room.moves.resize((m.steps + 1) * f.loads.size);
+        move_nodes(f.loads, g, x, room.moves.data());
+        g.node_moves = room.moves.data();
+    }
+    if (f.loads.family != NONE) {
+        room.local.resize((3 * m.steps + 1) * (1 + f.loads.size) * PARTS);
+        fill_local(f.loads, g, x, room.local.data());
+        g.local = room.local.data();
+    }
+    return g;
+}
+
+// One block of tangents: K of them from `first` in the order of Group.
+template <int K, bool Moving, class X>
+void measure_block(const Fit& f, const Group& g, X x, const Motion& motion, int64_t first, const Measured& to) {
+    const Known& m = f.known;
+    const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
+    auto column = [&](int64_t j) { return j < f.loads.size ? j : j < fixed ? f.tip + j : n - PLAIN + j - fixed; };
+    Dual<K> y[13];
+    for (auto& c : y) c = constant<K>(V{});
+    y[6].v = splat(1.0);
+    for (int i = 0; i < 6; i++) {
+        const double unit = i < 3 ? f.force_unit : f.moment_unit;
+        y[7 + i].v = unit * x(n - PLAIN + i);
+        if (i < 3 && m.Wn.data) y[7 + i].v -= fetch(m.Wn, g.lanes, i);
+        for (int j = 0; j < K; j++)
+            if (first + j - fixed == i) y[7 + i].d[j] = splat(unit);
+    }
+    auto put = [&](Mask here, int64_t z, const Dual<K>& value) {
+        to.h(z) = select(here, value.v, to.h(z));
+        for (int j = 0; j < K; j++) {
+            V& slot = to.H(z)[column(first + j)];
+            slot = select(here, value.d[j], slot);
+        }
+    };
+    walk<K, Moving>(g, y, first, false, [&](int64_t p, Mask here, const Dual<K>* y) {
+        const Vec<K> q{y[3], y[4], y[5]}, back = -q;
+        const Dual<K>& w = y[6];
+        if (p < P) {
+            Vec<K> r{y[0], y[1], y[2]};
+            for (int i = 0; i < 3; i++) to.line[3 * p + i] = select(here, r.c[i].v, to.line[3 * p + i]);
+            if (f.offsets) {
+                Vec<K> offset;
+                for (int i = 0; i < 3; i++) offset.c[i] = constant<K>(splat(f.offsets[3 * p + i]));
+                r = r + turned(q, w, offset);
+            }
+            if (f.registration) {
+                const int64_t zeta = n - 2 * PLAIN;
+                for (int i = 0; i < 3; i++) {
+                    const V* R = motion.R + 3 * i;
+                    put(here, 3 * p + i, R[0] * r.c[0] + R[1] * r.c[1] + R[2] * r.c[2] + motion.t[i]);
+                    for (int k = 0; k < 3; k++) {
+                        const V* dR = motion.dR[k] + 3 * i;
+                        V &shift = to.H(3 * p + i)[zeta + k], &turn = to.H(3 * p + i)[zeta + 3 + k];
+                        shift = splat(i == k ? f.length_unit : 0.0);
+                        turn = select(here, f.angle_unit * (dR[0] * r.c[0].v + dR[1] * r.c[1].v + dR[2] * r.c[2].v), turn);
+                    }
+                }
+            } else {
+                for (int i = 0; i < 3; i++) put(here, 3 * p + i, r.c[i]);
+            }
+            return;
+        }
+        Vec<K> force{y[7], y[8], y[9]}, moment{y[10], y[11], y[12]};
+        Stage<K> beyond;
+        local_of(g, 3 * m.steps, first, beyond);
+        force = force - beyond.G;
+        moment.c[0] = moment.c[0] - beyond.G2y, moment.c[1] = moment.c[1] + beyond.G2x;
+        for (int block = 0; block < f.tip / 3; block++) {
+            Vec<K>& c = block ? moment : force;
+            const double unit = block ? f.moment_unit : f.force_unit;
+            Vec<K> unknown;
+            for (int k = 0; k < 3; k++) {
+                const int64_t at = f.loads.size + 3 * block + k;
+                unknown.c[k] = constant<K>(unit * x(at));
+                Vec<K> axis{constant<K>(V{}), constant<K>(V{}), constant<K>(V{})};
+                axis.c[k].v = splat(unit);
+                const Vec<K> seen = turned(back, w, axis);
+                for (int i = 0; i < 3; i++) to.H(3 * P + 3 * block + i)[at] = -seen.c[i].v;
+            }
+            c = c - turned(back, w, unknown);
+        }
+        for (int i = 0; i < 3; i++) put(here, 3 * P + i, force.c[i]), put(here, 3 * P + 3 + i, moment.c[i]);
+    });
+}
+
+// h and H of the samples in the lanes. x(j): entry j of their states. Without `slopes` h alone.
+template <class X> Measured measure(const Fit& f, const Lanes& lanes, X x, bool slopes, Room& room) {
+    const int64_t n = f.size, P = f.known.outputs - 1;
+    room.rows.assign((3 * P + PLAIN) * (1 + n), V{});
+    room.line.assign(3 * P, V{});
+    const Measured to{room.rows.data(), room.line.data(), 1 + n};
+    const Group g = group_of(f, lanes, x, room);
+    Motion motion;
+    if (f.registration) {
+        V translation[3], turn[3];
+        for (int i = 0; i < 3; i++) {
+            translation[i] = f.length_unit * x(n - 2 * PLAIN + i);
+            turn[i] = f.angle_unit * x(n - PLAIN - 3 + i);
+        }
+        motion = Motion(translation, turn);
+    }
+    if (!slopes) measure_block<0, false>(f, g, x, motion, 0, to);
+    else
+        in_blocks(f.loads.size + f.tensions + PLAIN, [&](auto K, int64_t first) {
+            if (g.node_moves) measure_block<K(), true>(f, g, x, motion, first, to);
+            else measure_block<K(), false>(f, g, x, motion, first, to);
+        });
+    return to;
+}
+
+// H^T W H and H^T W r of the markers and of the tip residual apart, and the cost r^T W r of each.
+struct Normal {
+    V *A[2], *g[2], cost[2];
+    V seen;  // marker coordinates that were seen
+};
+
+INLINE void accumulate(const Measured& m, int64_t z, int64_t rows, const V* w, const V* r, int64_t n, V* A, V* g) {
+    for (int64_t i = 0; i < n; i++) {
+        V weighted[3];
+        for (int64_t k = 0; k < rows; k++) weighted[k] = w[k] * m.H(z + k)[i], g[i] += weighted[k] * r[k];
+        for (int64_t j = 0; j <= i; j++) {
+            V sum = A[i * n + j];
+            for (int64_t k = 0; k < rows; k++) sum += weighted[k] * m.H(z + k)[j];
+            A[i * n + j] = sum;
+        }
+    }
+}
+
+// r = z - h, zero where a marker is missing, takes the place of h. With Student's t of `robust` degrees of freedom each marker's weight is multiplied by
+// (nu + 3) / (nu + s), s = r^T W r of that marker, and its cost is (nu + 3) log(1 + s / nu): ekf.py, student_weights.
+inline Normal normal_equations(const Fit& f, const Lanes& lanes, const Measured& m, V* room) {
+    const int64_t n = f.size, P = f.known.outputs - 1, Z = 3 * P + PLAIN;
+    Normal N{{room, room + n * n}, {room + 2 * n * n, room + 2 * n * n + n}, {V{}, V{}}, V{}};
+    for (int64_t i = 0; i < 2 * n * n + 2 * n; i++) room[i] = V{};
+    for (int64_t z = 0; z < Z; z += 3) {
+        V w[3], r[3], square = V{};
+        const bool marker = z < 3 * P;
+        for (int k = 0; k < 3; k++) {
+            w[k] = fetch({f.w, Z}, lanes, z + k);
+            const V at = marker ? fetch({f.positions, 3 * P}, lanes, z + k) : V{};
+            r[k] = select(w[k] > 0, at - m.h(z + k), V{});
+            m.h(z + k) = r[k];
+            square += w[k] * r[k] * r[k];
+            if (marker) N.seen += select(w[k] > 0, splat(1.0), V{});
+        }
+        V cost = square;
+        if (marker && std::isfinite(f.robust)) {
+            const V factor = (f.robust + 3) / (f.robust + square);
+            for (auto& x : w) x *= factor;
+            cost = (f.robust + 3) * each(square / f.robust, [](double a) { return std::log1p(a); });
+        }
+        N.cost[!marker] += cost;
+        accumulate(m, z, 3, w, r, n, N.A[!marker], N.g[!marker]);
+    }
+    return N;
+}

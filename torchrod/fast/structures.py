@@ -1,0 +1,113 @@
+"""The structures of known.h, loads.h, measure.h, filter.h and kernel.cpp, for ctypes, and how tensors become them."""
+
+import ctypes
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+_I, _D, _P = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+class Table(ctypes.Structure):
+    """A tensor that the batch shares (stride 0) or that has one row per sample."""
+
+    _fields_ = [("data", _P), ("stride", _I)]
+
+
+class Known(ctypes.Structure):
+    """struct Known."""
+
+    _fields_ = [
+        *((n, _I) for n in ("steps", "tendons", "newton", "diagonal")),
+        *((n, _P) for n in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")),
+        *((n, Table) for n in ("h", "Gm", "Wn", "Wm", "u_star", "L", "dr", "tau", "at")),
+        ("outputs", _I),
+    ]
+
+
+class Loads(ctypes.Structure):
+    """struct Loads."""
+
+    _fields_ = [
+        *((n, _I) for n in ("family", "count", "per_load", "size")),
+        *((n, _D) for n in ("length", "force_scale")),
+        *((n, _P) for n in ("locations", "basis")),
+        *((n, Table) for n in ("s", "inside", "node")),
+    ]
+
+
+class Fit(ctypes.Structure):
+    """struct Fit."""
+
+    _fields_ = [
+        ("known", Known),
+        ("loads", Loads),
+        *((n, _I) for n in ("size", "tip", "tensions", "registration")),
+        *((n, _D) for n in ("force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "robust")),
+        *((n, _P) for n in ("offsets", "active")),
+        ("weight", Table),
+        *((n, _P) for n in ("positions", "w")),
+    ]
+
+
+class Filter(ctypes.Structure):
+    """struct Filter."""
+
+    _fields_ = [
+        *((n, _P) for n in ("mean", "precision", "Q")),
+        *((n, _D) for n in ("step", "decrement", "share", "settled", "hold")),
+        *((n, _P) for n in ("x", "Sigma", "before", "cap", "Sigma0", "done")),
+    ]
+
+
+class March(ctypes.Structure):
+    """struct March."""
+
+    _fields_ = [
+        ("known", Known),
+        *((n, _I) for n in ("batch", "tangents", "load_tangents", "reverse")),
+        *((n, _P) for n in ("y0", "dy0", "local", "dlocal", "out", "dout")),
+    ]
+
+
+class Sums(ctypes.Structure):
+    """struct Sums."""
+
+    _fields_ = [(n, _P) for n in ("A", "g", "cost", "r", "line")]
+
+
+# Tensors that may have a row per sample, and their dimensions when they have none.
+SHARED_DIMENSIONS = {
+    **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "tau": 3},
+    **{"at": 1, "s": 2, "inside": 2, "node": 1, "weight": 1},
+}
+
+
+def pointer(x: Tensor | None) -> int | None:
+    """The address of a contiguous tensor's first number; null for none."""
+    if x is None:
+        return None
+    assert x.is_contiguous(), "the kernel reads contiguous memory"
+    return x.data_ptr()
+
+
+def fill(structure: ctypes.Structure, tensors: Mapping[str, Tensor | None], numbers: Mapping[str, float | int]) -> None:
+    """Set every field of a structure, and of those within it, by name. The tensors must outlive its use."""
+    for name, kind, *_ in structure._fields_:
+        if kind is Table:
+            x = tensors.get(name)
+            rows = x is not None and x.ndim > SHARED_DIMENSIONS[name]
+            setattr(structure, name, Table(pointer(x), x[0].numel() if x is not None and rows else 0))
+        elif kind is _P:
+            setattr(structure, name, pointer(tensors.get(name)))
+        elif isinstance(kind, type) and issubclass(kind, ctypes.Structure):
+            fill(getattr(structure, name), tensors, numbers)
+        else:
+            value = numbers[name]
+            setattr(structure, name, value if kind is _D else int(value))
+
+
+def threads(samples: int, lanes: int) -> int:
+    """As many as torch has, but none for less than one group of lanes."""
+    return max(1, min(torch.get_num_threads(), samples // lanes))

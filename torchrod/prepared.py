@@ -1,0 +1,214 @@
+"""A model and a chunk of markers made ready for the filter, which evaluates them many times: by the compiled kernel where it
+serves, else by the torch model, which is the definition.
+
+Every robot of one section, and every family of loads in torchrod.coordinates, goes through the kernel; loads of a user's own
+coordinates go through the torch model with a compiled march.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from . import ekf, fast
+from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
+from .grid import Grid
+from .jacobian import forward_jacobian
+from .loads import total
+from .measurement import TURN_SCALE, Markers, Model
+from .statics import beyond_tip, grid_for, stage_table
+from .step import Section
+
+MOST_TENDONS = 16  # of the kernel
+
+
+def family_of(model: Model) -> str | None:
+    """Which of the kernel's load families serves the model's coordinates; None: none does."""
+    c = model.coordinates
+    if c.size == 0:
+        return "none"
+    if isinstance(c, GaussianCoordinates | PaperCoordinates):
+        return "gaussian" if isinstance(c, GaussianCoordinates) else "paper"
+    if isinstance(c, FourierCoordinates) or (isinstance(c, PointCoordinates) and c.locations is not None):
+        return "linear"
+    return "point" if isinstance(c, PointCoordinates) else None
+
+
+def served(model: Model, like: Tensor) -> bool:
+    """Whether the kernel can do the fit. Nodes that move with a point load take along neither curvature nor routing that vary."""
+    robot, family = model.robot, family_of(model)
+    plain = robot.rod.K_se.ndim == 2 and like.dtype == torch.float64 and like.device.type == "cpu"
+    if not plain or family is None or len(robot.tendons) > MOST_TENDONS:
+        return False
+    if family == "point":
+        straight = all(len(t.routing) == 1 for t in robot.tendons.tendons)
+        return fast.available() and straight and len(robot.rod.reference_curvature) == 1
+    return fast.available()
+
+
+def _basis(model: Model, grid: Grid) -> Float[Tensor, "points g 5"]:
+    """What one unit of each entry of gamma adds to [G, G2_x, G2_y] at every stage and beyond the tip, for loads linear in it."""
+    gamma = model.coordinates.start().unsqueeze(0)
+
+    def integrals(gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B points5"]:
+        loads = model.coordinates.loads(gamma)
+        along, tip = total(loads, grid.stages, grid.inside), beyond_tip(model.robot, loads, gamma.new_zeros(()))
+        assert along.G is not None and along.G2 is not None and tip.G is not None and tip.G2 is not None
+        G = torch.cat([along.G.flatten(1, 2), tip.G.unsqueeze(1)], 1)
+        G2 = torch.cat([along.G2.flatten(1, 2), tip.G2.unsqueeze(1)], 1)
+        return torch.cat([G, G2[..., :2]], -1).flatten(1)
+
+    _, slope = forward_jacobian(integrals, gamma)
+    return slope[0].unflatten(0, (-1, 5)).mT.contiguous()
+
+
+def _grid_at(model: Model, markers: Markers, x: Float[Tensor, "B n"] | None) -> Grid:
+    """The grid, of each sample its own where x moves the nodes."""
+    gamma = model.coordinates.start().unsqueeze(0) if x is None else x[:, : model.coordinates.size]
+    grid = grid_for(model.robot, model.coordinates.loads(gamma) if gamma.shape[-1] else (), markers.s, model.steps)
+    return Grid(grid.nodes[0], grid.outputs[0]) if x is None and grid.nodes.ndim == 2 else grid
+
+
+def _nodes_of(nodes: Float[Tensor, "B S1"], at: Float[Tensor, "B K"]) -> Int[Tensor, "B K"]:
+    """Which node each moving place is: where several coincide make_grid's sort puts the fixed one first, the moving ones in order."""
+    later = (at.unsqueeze(-1) == at.unsqueeze(-2)).triu(1).sum(-1)
+    return torch.searchsorted(nodes.contiguous(), at.contiguous(), right=True) - 1 - later
+
+
+def _along(model: Model, markers: Markers, grid: Grid) -> tuple[dict[str, Tensor | None], dict[str, int]]:
+    """The robot on its grid: struct Known and the stages."""
+    robot = model.robot
+    section = Section.of(robot.rod.K_se, robot.rod.K_bt)
+    table = stage_table(robot, (), markers.tension, grid)
+    tensors, counts = fast.known(section, table, grid, grid.outputs_and_tip)
+    tensors |= {"s": grid.stages.contiguous(), "inside": grid.inside.contiguous(), "offsets": markers.offsets}
+    return tensors | {"weight": robot.weight}, counts
+
+
+def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, x: Float[Tensor, "B n"] | None) -> fast.FitTables:
+    """Everything of torchrod.fast.fitting, with nodes as x has them where it moves them."""
+    rod, c, family = model.robot.rod, model.coordinates, family_of(model)
+    assert family is not None
+    grid = _grid_at(model, markers, x)
+    tensors, counts = _along(model, markers, grid)
+    locations = getattr(c, "locations", None)
+    if family == "linear":
+        tensors["basis"] = _basis(model, grid)
+    if family == "gaussian" and locations is not None:
+        tensors["locations"] = torch.tensor(locations, dtype=w.dtype)
+    if family == "point":
+        assert x is not None
+        tensors["node"] = _nodes_of(grid.nodes, torch.sigmoid(x[:, 2 : c.size : 3]) * rod.length)
+    counts |= {
+        "family": fast.FAMILIES[family],
+        "count": getattr(c, "count", 0),
+        "per_load": c.size // max(getattr(c, "count", 1), 1),
+        "gamma": c.size,
+        "size": model.size,
+        "tip": model.load_size - c.size,
+        "tensions": 0,
+        "registration": int(model.registration),
+    }
+    scaled = model.scaled
+    numbers = {
+        "length": rod.length,
+        "force_scale": getattr(c, "force_scale", 1.0),
+        "force_unit": rod.force_scale if scaled else 1.0,
+        "moment_unit": rod.moment_scale if scaled else 1.0,
+        "length_unit": TURN_SCALE * rod.length if scaled else 1.0,
+        "angle_unit": TURN_SCALE if scaled else 1.0,
+        "tension_unit": 1.0,
+        "robust": nu,
+    }
+    tensors = fast.with_rows(tensors, len(w))
+    return fast.FitTables.of(tensors | {"positions": markers.positions, "w": w}, counts, numbers)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """model and markers, with weights w (B, z) and the degrees of freedom nu of Student's t (inf: a normal distribution)."""
+
+    model: Model
+    markers: Markers
+    w: Float[Tensor, "B z"]
+    nu: float = math.inf
+
+    def take(self, index: Int[Tensor, " b"]) -> "Prepared":
+        """The samples of an index."""
+        return Prepared(self.model, self.markers.take(index), self.w[index], self.nu)
+
+    @cached_property
+    def compiled(self) -> bool:
+        """Whether the kernel serves."""
+        return served(self.model, self.w)
+
+    @cached_property
+    def _fixed(self) -> fast.FitTables:
+        return _tables(self.model, self.markers, self.w, self.nu, None)
+
+    @cached_property
+    def _prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        return self.model.prior()
+
+    def tables(self, x: Float[Tensor, "B n"]) -> fast.FitTables:
+        """What the kernel is handed, for all samples."""
+        moving = family_of(self.model) == "point"
+        return _tables(self.model, self.markers, self.w, self.nu, x) if moving else self._fixed
+
+    def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
+        """Model.h, without derivatives."""
+        if not self.compiled:
+            return self.model.h(x, self.markers, differentiable=False)
+        t = self.tables(x)
+        return fast.measure(x, torch.arange(len(x)), False, t.tensors, t.counts, t.numbers)[0]
+
+    def residual(self, h: Float[Tensor, "B z"]) -> Float[Tensor, "B z"]:
+        """r = z - h(x), zero where a marker is missing."""
+        z = torch.cat([self.markers.positions.flatten(1), h.new_zeros(len(h), 6)], -1)
+        return torch.where(self.w > 0, z - h, 0.0)
+
+    def cost(self, x: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
+        """The cost of (3) with the prior's, r^T W r + (x0 - x)^T P (x0 - x)."""
+        r = self.residual(self.h(x))
+        s, _ = ekf.student((self.w * r * r)[:, :-6].unflatten(-1, (-1, 3)).sum(-1), self.nu)
+        mean, precision = self._prior
+        return s.sum(-1) + (self.w * r * r)[:, -6:].sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+
+    def sums(self, x: Float[Tensor, "B n"]) -> fast.Sums:
+        """At x: the normal equations, the residuals and the centre line (m, the rod's own frame)."""
+        if self.compiled:
+            t = self.tables(x)
+            return fast.Sums(*fast.normal_equations(x, t.tensors, t.counts, t.numbers))
+        h, H = self.model.linearized(x, self.markers)
+        r = self.residual(h)
+        N = ekf.normal_equations(H, r, self.w, self.nu)
+        return fast.Sums(N.A, N.g, N.cost, r, self.model.shape(x, self.markers, differentiable=False).p)
+
+    def normal(self, sums: fast.Sums) -> ekf.Normal:
+        """As torchrod.ekf has them."""
+        return ekf.Normal(sums.A, sums.g, sums.cost, (self.w[:, :-6] > 0).sum(-1))
+
+    def iterate(
+        self,
+        at: ekf.Iterate,
+        live: Int[Tensor, " b"],
+        Sigma0: Float[Tensor, "B n n"],
+        Q: Float[Tensor, " n"],
+        limits: ekf.Limits,
+        sums: fast.Sums,
+    ) -> Bool[Tensor, " b"]:
+        """One iteration of the filter on the samples `live`, in place; which of them are done, whose sums are kept."""
+        mean, precision = self._prior
+        if self.compiled:
+            filtering = {"Sigma0": Sigma0, "mean": mean, "precision": precision, "Q": Q}
+            fast.iterate(self.tables(at.x), vars(at), live, filtering, limits._asdict(), sums)
+        else:
+            part = self.take(live)
+            here = at.take(live)
+            found = part.sums(here.x)
+            at.put(live, ekf.advance(here, part.normal(found), Sigma0[live], self._prior, Q, limits))
+            sums.put(live, found)
+        return at.done[live]
