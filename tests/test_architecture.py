@@ -22,7 +22,7 @@ LAYERS = [
     {"io", "plot", "selection"},
     {"calibration", "placement"},
     {"unloaded", "observability"},
-    {"probe"},
+    {"probe", "stream"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
     {"prepared"},

@@ -113,7 +113,7 @@ def test_one_iteration_of_the_filter(hold):
     expected = ekf.advance(start, prepared.normal(prepared.sums(x)), Sigma0, model.prior(), Q, limits)
     live = torch.tensor([0, 1, 3, 4])
     after = ekf.Iterate(*(getattr(start, k).clone() for k in ("x", "Sigma", "before", "cap", "done")))
-    prepared.iterate(after, live, Sigma0, Q, limits, sums)
+    prepared.iteration(after, Sigma0, Q, limits, sums)(live)
     for name in ("x", "Sigma", "before", "cap"):
         a, b = getattr(after, name), getattr(expected, name)
         assert torch.allclose(a[live], b[live], rtol=1e-7, atol=1e-9, equal_nan=True), name

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from .starts import Start, cold_start
     from .statics import Equilibrium, Shape, shape_from_base, solve_shape
     from .status import Status
+    from .stream import Estimator
     from .tendons import Tendon, Tendons
     from .warmstart import WarmStart, find_warm_start
 
@@ -60,6 +61,7 @@ _HOMES = {
     "starts": ("Start", "cold_start"),
     "statics": ("Equilibrium", "Shape", "shape_from_base", "solve_shape"),
     "status": ("Status",),
+    "stream": ("Estimator",),
     "tendons": ("Tendon", "Tendons"),
     "warmstart": ("WarmStart", "find_warm_start"),
 }
@@ -70,6 +72,7 @@ __all__ = [
     "DatasetSpec",
     "Equilibrium",
     "Estimate",
+    "Estimator",
     "Fit",
     "FourierCoordinates",
     "FourierLoads",

@@ -109,7 +109,9 @@ def _filter(
     iterations, live = torch.zeros(len(x), dtype=torch.int64), ok.nonzero().squeeze(-1)
     sums = Sums.room(len(x), model.size, len(markers.s))
     limits = ekf.Limits(step=settings.step_limit)
-    coarse = replace(prepared, model=replace(model, steps=min(model.steps, COARSE_STEPS)))
+    rough = replace(prepared, model=replace(model, steps=min(model.steps, COARSE_STEPS)))
+    fine = prepared.iteration(at, Sigma0, Q, limits, sums)
+    coarse = rough.iteration(at, Sigma0, Q, limits._replace(decrement=NEAR, hold=False), sums)
     near = torch.full((len(x),), not settings.coarse or model.steps <= COARSE_STEPS)
     for iteration in range(settings.max_iterations):
         if not len(live):
@@ -117,10 +119,10 @@ def _filter(
         iterations[live] += 1
         far, close = live[~near[live]], live[near[live]]
         if len(far):
-            near[far] = coarse.iterate(at, far, Sigma0, Q, limits._replace(decrement=NEAR, hold=False), sums)
+            near[far] = coarse(far)
             near[far] |= 2 * iteration >= settings.max_iterations
         if len(close):
-            done = prepared.iterate(at, close, Sigma0, Q, limits, sums)
+            done = fine(close)
             status[close[done]] = int(Status.CONVERGED)
             progress(int(done.sum()))
             live = torch.cat([far, close[~done]]).sort().values

@@ -115,13 +115,14 @@ def _facing(way: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4"]:
 
 
 def features(model: Model, markers: Markers, noise: float) -> Features:
-    """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod; one forward solve serves all."""
+    """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod."""
     L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
     stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
     places = torch.cat([markers.s, stations, torch.linspace(L / GRID, L, GRID, dtype=DTYPE)])
-    rest = solve_shape(model.robot, (), markers.tension, places, len(seen), model.steps, ROUGH_TOLERANCE)
+    alike = markers.tension is None and model.robot.gravity.ndim == 1  # then one forward solve serves all
+    rest = solve_shape(model.robot, (), markers.tension, places, 1 if alike else len(seen), model.steps, ROUGH_TOLERANCE)
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
-    p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
+    p0 = torch.where(torch.isfinite(rest.p), rest.p, straight).expand(len(seen), -1, -1)
     sigma = torch.tensor(noise / L, dtype=DTYPE)
     y, k = smoothed(markers.s / L, (markers.positions - p0[:, :P]) / L, seen, noise / L)
     amp = k[..., :2].square().sum(-1).mean(-1).sqrt().clamp(min=AMP_LEAST)
@@ -138,7 +139,8 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
         moment = turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1)
         parts += [pull, moment, turned(weight), turned(p0[:, P : P + STATIONS] / L)]
     q_tip = _facing((p0[:, -1] + L * y[:, -1]) - (p0[:, -2] + L * y[:, -2]))
-    return Features(torch.cat(parts, -1), amp, turn, count, rest.base_wrench.nan_to_num(0.0), q_tip)
+    alpha = rest.base_wrench.nan_to_num(0.0).expand(len(seen), 6)
+    return Features(torch.cat(parts, -1), amp, turn, count, alpha, q_tip)
 
 
 def prior_log_c(model: Model) -> float:

@@ -6,8 +6,9 @@ coordinates go through the torch model with a compiled march.
 """
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -65,66 +66,103 @@ def _basis(model: Model, grid: Grid) -> Float[Tensor, "points g 5"]:
     return slope[0].unflatten(0, (-1, 5)).mT.contiguous()
 
 
-def _grid_at(model: Model, markers: Markers, x: Float[Tensor, "B n"] | None) -> Grid:
+def _grid_at(model: Model, s: Float[Tensor, " P"], x: Float[Tensor, "B n"] | None) -> Grid:
     """The grid, of each sample its own where x moves the nodes."""
     gamma = model.coordinates.start().unsqueeze(0) if x is None else x[:, : model.coordinates.size]
-    grid = grid_for(model.robot, model.coordinates.loads(gamma) if gamma.shape[-1] else (), markers.s, model.steps)
+    grid = grid_for(model.robot, model.coordinates.loads(gamma) if gamma.shape[-1] else (), s, model.steps)
     return Grid(grid.nodes[0], grid.outputs[0]) if x is None and grid.nodes.ndim == 2 else grid
 
 
 def _nodes_of(nodes: Float[Tensor, "B S1"], at: Float[Tensor, "B K"]) -> Int[Tensor, "B K"]:
-    """Which node each moving place is: where several coincide make_grid's sort puts the fixed one first, the moving ones in order."""
+    """Which node each moving place is: of several at one place, the grid has the fixed one first, then the moving ones in order."""
     later = (at.unsqueeze(-1) == at.unsqueeze(-2)).triu(1).sum(-1)
     return torch.searchsorted(nodes.contiguous(), at.contiguous(), right=True) - 1 - later
 
 
-def _along(model: Model, markers: Markers, grid: Grid) -> tuple[dict[str, Tensor | None], dict[str, int]]:
-    """The robot on its grid: struct Known and the stages."""
-    robot = model.robot
-    section = Section.of(robot.rod.K_se, robot.rod.K_bt)
-    table = stage_table(robot, (), markers.tension, grid)
-    tensors, counts = fast.known(section, table, grid, grid.outputs_and_tip)
-    tensors |= {"s": grid.stages.contiguous(), "inside": grid.inside.contiguous(), "offsets": markers.offsets}
-    return tensors | {"weight": robot.weight}, counts
+@dataclass(frozen=True)
+class Layout:
+    """What stays from shape to shape, by the names of torchrod.fast.fitting. active: (S, 3, T), 1 where a tendon pulls."""
+
+    tensors: dict[str, Tensor | None]
+    counts: dict[str, int]
+    numbers: dict[str, float]
+    active: Float[Tensor, "... S 3 T"] | None
+
+    @cached_property
+    def shared(self) -> fast.FitTables | None:
+        """For every sample, where none has a row of its own but for its measurements."""
+        if self.active is not None or any(x is not None and x.ndim > d for x, d in self._rows()):
+            return None
+        return fast.FitTables.of(self.tensors, self.counts, self.numbers | {"robust": math.inf})
+
+    def _rows(self) -> list[tuple[Tensor | None, int]]:
+        return [(x, fast.SHARED_DIMENSIONS[name]) for name, x in self.tensors.items() if name in fast.SHARED_DIMENSIONS]
 
 
-def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, x: Float[Tensor, "B n"] | None) -> fast.FitTables:
-    """Everything of torchrod.fast.fitting, with nodes as x has them where it moves them."""
-    rod, c, family = model.robot.rod, model.coordinates, family_of(model)
-    assert family is not None
-    grid = _grid_at(model, markers, x)
-    tensors, counts = _along(model, markers, grid)
-    locations = getattr(c, "locations", None)
-    if family == "linear":
-        tensors["basis"] = _basis(model, grid)
-    if family == "gaussian" and locations is not None:
-        tensors["locations"] = torch.tensor(locations, dtype=w.dtype)
-    if family == "point":
-        assert x is not None
-        tensors["node"] = _nodes_of(grid.nodes, torch.sigmoid(x[:, 2 : c.size : 3]) * rod.length)
-    counts |= {
-        "family": fast.FAMILIES[family],
-        "count": getattr(c, "count", 0),
-        "per_load": c.size // max(getattr(c, "count", 1), 1),
-        "gamma": c.size,
-        "size": model.size,
-        "tip": model.load_size - c.size,
-        "tensions": 0,
-        "registration": int(model.registration),
-    }
-    scaled = model.scaled
-    numbers = {
+def _numbers(model: Model) -> dict[str, float]:
+    """Units of the entries of x."""
+    rod, scaled = model.robot.rod, model.scaled
+    return {
         "length": rod.length,
-        "force_scale": getattr(c, "force_scale", 1.0),
+        "force_scale": getattr(model.coordinates, "force_scale", 1.0),
         "force_unit": rod.force_scale if scaled else 1.0,
         "moment_unit": rod.moment_scale if scaled else 1.0,
         "length_unit": TURN_SCALE * rod.length if scaled else 1.0,
         "angle_unit": TURN_SCALE if scaled else 1.0,
         "tension_unit": 1.0,
-        "robust": nu,
     }
-    tensors = fast.with_rows(tensors, len(w))
-    return fast.FitTables.of(tensors | {"positions": markers.positions, "w": w}, counts, numbers)
+
+
+def _layout(
+    model: Model, s: Float[Tensor, " P"], offsets: Float[Tensor, "P 3"] | None, x: Float[Tensor, "B n"] | None = None
+) -> Layout:
+    """The robot, its loads and its markers on the grid, with nodes as x has them where it moves them."""
+    robot, c, family = model.robot, model.coordinates, family_of(model)
+    assert family is not None
+    grid = _grid_at(model, s, x)
+    section, table = Section.of(robot.rod.K_se, robot.rod.K_bt), stage_table(robot, (), None, grid)
+    active = None
+    if len(robot.tendons):
+        tendons = robot.tendons.table(grid.stages, grid.inside, s.new_ones(len(robot.tendons)))
+        table, active = replace(table, tendons=tendons), tendons.tau
+    tensors, counts = fast.known(section, table, grid, grid.outputs_and_tip)
+    tensors |= {"s": grid.stages.contiguous(), "inside": grid.inside.contiguous(), "offsets": offsets, "weight": robot.weight}
+    locations = getattr(c, "locations", None)
+    if family == "linear":
+        tensors["basis"] = _basis(model, grid)
+    if family == "gaussian" and locations is not None:
+        tensors["locations"] = torch.tensor(locations, dtype=s.dtype)
+    if family == "point":
+        assert x is not None
+        tensors["node"] = _nodes_of(grid.nodes, torch.sigmoid(x[:, 2 : c.size : 3]) * robot.rod.length)
+    loads = {"family": fast.FAMILIES[family], "count": getattr(c, "count", 0), "gamma": c.size}
+    loads["per_load"] = c.size // max(loads["count"], 1)
+    state = {"size": model.size, "tip": model.load_size - c.size, "tensions": 0, "registration": int(model.registration)}
+    return Layout(tensors, counts | loads | state, _numbers(model), active)
+
+
+@lru_cache(maxsize=32)
+def _kept_layout(model: Model, s: Tensor, offsets: Tensor | None, versions: tuple[int, ...]) -> Layout:
+    return _layout(model, s, offsets)
+
+
+def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, x: Float[Tensor, "B n"] | None) -> fast.FitTables:
+    """Everything of torchrod.fast.fitting. The layout is kept for the next shapes, unless a tensor in it has been changed since."""
+    robot = model.robot
+    if x is None:
+        held = (markers.s, markers.offsets, robot.gravity, *(v for v in vars(robot.rod).values() if isinstance(v, Tensor)))
+        versions = tuple(v._version for v in held if v is not None)
+        layout = _kept_layout(model, markers.s, markers.offsets, versions)
+    else:
+        layout = _layout(model, markers.s, markers.offsets, x)
+    if layout.shared is not None:
+        return layout.shared.with_rows(markers.positions, w, nu)
+    tensors, counts = layout.tensors | {"positions": markers.positions, "w": w}, layout.counts
+    if layout.active is not None and markers.tension is not None:
+        tension = robot.tendons.true_tension(markers.tension)
+        tensors["tau"] = tension[:, None, None, :] * layout.active
+        counts = counts | {"newton": robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension)}
+    return fast.FitTables.of(fast.with_rows(tensors, len(w)), counts, layout.numbers | {"robust": nu})
 
 
 @dataclass(frozen=True)
@@ -163,7 +201,7 @@ class Prepared:
         if not self.compiled:
             return self.model.h(x, self.markers, differentiable=False)
         t = self.tables(x)
-        return fast.measure(x, torch.arange(len(x)), False, t.tensors, t.counts, t.numbers)[0]
+        return fast.measure_now(x, torch.arange(len(x)), False, t.structure, t.markers)[0]
 
     def residual(self, h: Float[Tensor, "B z"]) -> Float[Tensor, "B z"]:
         """r = z - h(x), zero where a marker is missing."""
@@ -181,7 +219,7 @@ class Prepared:
         """At x: the normal equations, the residuals and the centre line (m, the rod's own frame)."""
         if self.compiled:
             t = self.tables(x)
-            return fast.Sums(*fast.normal_equations(x, t.tensors, t.counts, t.numbers))
+            return fast.Sums(*fast.normal_equations_now(x, t.structure, t.markers))
         h, H = self.model.linearized(x, self.markers)
         r = self.residual(h)
         N = ekf.normal_equations(H, r, self.w, self.nu)
@@ -191,24 +229,25 @@ class Prepared:
         """As torchrod.ekf has them."""
         return ekf.Normal(sums.A, sums.g, sums.cost, (self.w[:, :-6] > 0).sum(-1))
 
-    def iterate(
-        self,
-        at: ekf.Iterate,
-        live: Int[Tensor, " b"],
-        Sigma0: Float[Tensor, "B n n"],
-        Q: Float[Tensor, " n"],
-        limits: ekf.Limits,
-        sums: fast.Sums,
-    ) -> Bool[Tensor, " b"]:
-        """One iteration of the filter on the samples `live`, in place; which of them are done, whose sums are kept."""
-        mean, precision = self._prior
+    def iteration(
+        self, at: ekf.Iterate, Sigma0: Float[Tensor, "B n n"], Q: Float[Tensor, " n"], limits: ekf.Limits, sums: fast.Sums
+    ) -> Callable[[Int[Tensor, " b"]], Bool[Tensor, " b"]]:
+        """One iteration of the filter on some samples, in place; it returns which of them are done, whose sums are kept."""
         if self.compiled:
+            mean, precision = self._prior
             filtering = {"Sigma0": Sigma0, "mean": mean, "precision": precision, "Q": Q}
-            fast.iterate(self.tables(at.x), vars(at), live, filtering, limits._asdict(), sums)
+            call = fast.Iteration(vars(at), filtering, limits._asdict(), sums)
         else:
-            part = self.take(live)
-            here = at.take(live)
-            found = part.sums(here.x)
-            at.put(live, ekf.advance(here, part.normal(found), Sigma0[live], self._prior, Q, limits))
-            sums.put(live, found)
-        return at.done[live]
+            call = None
+
+        def once(live: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
+            if call is not None:
+                call(self.tables(at.x), live)
+            else:
+                part, here = self.take(live), at.take(live)
+                found = part.sums(here.x)
+                at.put(live, ekf.advance(here, part.normal(found), Sigma0[live], self._prior, Q, limits))
+                sums.put(live, found)
+            return at.done[live]
+
+        return once

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,7 +12,7 @@ from torch import Tensor
 from . import ekf
 from .coordinates import LoadReport
 from .fast import Sums
-from .jacobian import forward_jacobian
+from .jacobian import pointwise_jacobian
 from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from .measurement import TIP_EXACT, Model
 from .prepared import Prepared
@@ -206,11 +207,11 @@ def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Ten
     """Covariance of [F_x, F_y, location, width] per load, carried over from x by the derivative of `describe`."""
     n = model.coordinates.size
 
-    def described(gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B k4"]:
+    def described(gamma: Float[Tensor, "... g"]) -> Float[Tensor, "... k4"]:
         report = model.coordinates.describe(gamma)
         return torch.cat([report.force, report.location.unsqueeze(-1), report.width.unsqueeze(-1)], -1).flatten(-2)
 
-    _, J = forward_jacobian(described, x[:, :n])
+    _, J = pointwise_jacobian(described, x[:, :n])
     J = J.unflatten(1, (-1, 4))
     return J @ covariance[:, None, :n, :n] @ J.transpose(-1, -2)
 
@@ -222,6 +223,12 @@ def tip_covariance(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Te
     block = covariance[:, first:last, first:last]
     rest = 6 - (last - first)
     return torch.nn.functional.pad(block, (0, rest, 0, rest)) * scale * scale.unsqueeze(-1)
+
+
+@lru_cache(maxsize=4096)
+def _limit(dof: int) -> float:
+    """The 99.9 % point of chi^2."""
+    return float(chi2_distribution.ppf(ACCEPT, max(dof, 1)))
 
 
 def make_estimate(
@@ -251,7 +258,7 @@ def make_estimate(
     covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *model.prior())[0])
     present = markers.present
     dof = 3 * present.sum(-1) + 6 + model.coordinates.informative_priors - model.size
-    limit = torch.from_numpy(chi2_distribution.ppf(ACCEPT, dof.clamp(min=1).numpy()))
+    limit = torch.tensor([_limit(k) for k in dof.tolist()], dtype=cost.dtype)
     residual = sums.r[:, :-6].unflatten(-1, (-1, 3))
     return Estimate(
         x=kept(x),

@@ -44,7 +44,9 @@ def equilibrium_wrench(
 
 def cold_start(model: Model, markers: Markers, noise: float) -> Start:
     """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
-    x = cold_from(model, equilibrium_wrench(model, (), markers))
+    alike = markers.tension is None and model.robot.gravity.ndim == 1
+    alpha = equilibrium_wrench(model, (), markers.take(torch.arange(1)) if alike else markers)
+    x = cold_from(model, alpha.expand(len(markers.positions), 6))
     return Start(x, None, torch.zeros(len(x), dtype=torch.bool))
 
 
@@ -64,11 +66,10 @@ def better_start(
     index = start.warm.nonzero().squeeze(-1)
     if not len(index):
         return start, start.warm
-    part = markers.take(index)
-    prepared = Prepared(model, part, model.weights(part, noise))
-    cold = cold_start(model, part, noise).x if start.cold is None else start.cold[index]
-
-    worse = ~(prepared.cost(start.x[index]).nan_to_num(torch.inf) < prepared.cost(cold).nan_to_num(torch.inf))
+    cold = cold_start(model, markers.take(index), noise).x if start.cold is None else start.cold[index]
+    both = markers.take(index.repeat(2))
+    cost = Prepared(model, both, model.weights(both, noise)).cost(torch.cat([start.x[index], cold])).nan_to_num(torch.inf)
+    worse = ~(cost[: len(index)] < cost[len(index) :])
     dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
     x = start.x.clone()
     x[dropped] = cold[worse]

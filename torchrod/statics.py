@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .grid import DEFAULT_STEPS, Grid, make_grid
-from .jacobian import forward_jacobian
+from .jacobian import pointwise_jacobian
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, matvec, normalized, rotate
 from .loads import Load, LoadIntegrals, total
 from .march import march, march_linearized, states_at
@@ -30,10 +30,7 @@ LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put o
 
 
 def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid) -> StageTable:
-    """All that is known along the rod, at the stages of every step of the grid. tension: (..., T) readings, N.
-
-    The only place where a reading becomes the tension that pulls.
-    """
+    """All that is known along the rod, at the stages of every step of the grid. tension: (..., T) readings, N."""
     s, inside = grid.stages, grid.inside
     integrals = total(loads, s, inside) + robot.weight_beyond(s)
     tendons = None
@@ -165,12 +162,14 @@ class _TipProblem:
         """r(q_tip), the rotation vector by which the base misses the identity (rad), and its derivatives (B, 3, n)."""
         first = torch.zeros(*self.grid.nodes.shape[:-1], 1, dtype=torch.int64)
         states, tangents = self.march(q_tip, dq_tip, fraction, first)
-        r, dr = forward_jacobian(roma.unitquat_to_rotvec, states[:, 0, 3:7])
+        if dq_tip.shape[-1] == 0:
+            return roma.unitquat_to_rotvec(states[:, 0, 3:7]), tangents[:, 0, :3]
+        r, dr = pointwise_jacobian(roma.unitquat_to_rotvec, states[:, 0, 3:7])
         return r, dr @ tangents[:, 0, 3:7]
 
     def newton_step(self, q_tip: Float[Tensor, "B 4"], fraction: Float[Tensor, " B"]) -> tuple[Vector, Vector]:
         """r, and the tip's turn -J^-1 r in the base frame."""
-        _, dq = forward_jacobian(lambda w: turned(w, q_tip), torch.zeros_like(q_tip[:, :3]))
+        _, dq = pointwise_jacobian(lambda w: turned(w, q_tip), torch.zeros_like(q_tip[:, :3]))
         r, J = self.base(q_tip, dq, fraction)
         return r, -matvec(inverse3(J), r)
 

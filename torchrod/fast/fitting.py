@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .build import library
-from .structures import Filter, Fit, fill, threads
+from .structures import Filter, Fit, fill, pointer, threads
 from .structures import Sums as CSums
 
 FAMILIES = {"none": 0, "gaussian": 1, "paper": 2, "point": 3, "linear": 4}
@@ -62,6 +62,15 @@ class FitTables:
         """P."""
         return _outputs(self.counts)
 
+    def with_rows(self, positions: Float[Tensor, "B P 3"], w: Float[Tensor, "B z"], nu: float) -> "FitTables":
+        """The same robot with the rows of other samples, where nothing else has a row per sample: a copy of the structure."""
+        rows = [positions.contiguous(), w.contiguous()]
+        other = FitTables([*self.tensors[:-2], *rows], self.counts, [*self.numbers[:-1], nu])
+        copy = Fit.from_buffer_copy(self.structure)
+        copy.positions, copy.w, copy.robust = pointer(rows[0]), pointer(rows[1]), nu
+        vars(other)["structure"] = copy
+        return other
+
 
 def _structure(tensors: list[Tensor], counts: list[int], numbers: list[float]) -> Fit:
     named = {name: x if x.numel() else None for name, x in zip(TENSORS, tensors, strict=True)}
@@ -90,18 +99,23 @@ def _outputs(counts: list[int]) -> int:
     return counts[COUNTS.index("outputs")] - 1
 
 
+def measure_now(x: Tensor, index: Tensor, slopes: bool, fit: Fit, P: int) -> tuple[Tensor, Tensor, Tensor]:
+    """torchrod::measure without torch's dispatcher, for a loop that is not to be traced."""
+    b, n = len(x), x.shape[-1]
+    h, line = x.new_empty(b, 3 * P + 6), x.new_empty(b, P, 3)
+    H = x.new_empty(b, 3 * P + 6, n if slopes else 0)
+    x, index = x.contiguous(), index.contiguous()
+    address = _at(H) if slopes else ctypes.c_void_p(None)
+    _run("torchrod_measure", b, ctypes.byref(fit), _at(x), _at(index), ctypes.c_int64(b), _at(h), address, _at(line))
+    return h, H, line
+
+
 @torch.library.custom_op("torchrod::measure", mutates_args=(), device_types="cpu")
 def measure(
     x: Tensor, index: Tensor, slopes: bool, tensors: list[Tensor], counts: list[int], numbers: list[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """h (b, 3 P + 6), H (b, 3 P + 6, n) (without `slopes`: n = 0), centre line (b, P, 3): of samples `index` at x (b, n)."""
-    b, n, P = len(x), x.shape[-1], _outputs(counts)
-    h, line = x.new_empty(b, 3 * P + 6), x.new_empty(b, P, 3)
-    H = x.new_empty(b, 3 * P + 6, n if slopes else 0)
-    fit, x, index = _structure(tensors, counts, numbers), x.contiguous(), index.contiguous()
-    address = _at(H) if slopes else ctypes.c_void_p(None)
-    _run("torchrod_measure", b, ctypes.byref(fit), _at(x), _at(index), ctypes.c_int64(b), _at(h), address, _at(line))
-    return h, H, line
+    return measure_now(x, index, slopes, _structure(tensors, counts, numbers), _outputs(counts))
 
 
 @measure.register_fake
@@ -157,18 +171,23 @@ def measured(x: Float[Tensor, "b n"], index: Int[Tensor, " b"], tables: FitTable
     return _Measured.apply(x, index, tables.tensors, tables.counts, tables.numbers)[0]  # pyright: ignore[reportOptionalSubscript]
 
 
+def normal_equations_now(x: Tensor, fit: Fit, P: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """torchrod::normal_equations without torch's dispatcher."""
+    B, n = len(x), x.shape[-1]
+    A, g, cost = x.new_empty(B, 2, n, n), x.new_empty(B, 2, n), x.new_empty(B, 2)
+    r, line = x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
+    sums, x = CSums(), x.contiguous()
+    fill(sums, {"A": A, "g": g, "cost": cost, "r": r, "line": line}, {})
+    _run("torchrod_normal", B, ctypes.byref(fit), _at(x), ctypes.c_int64(B), ctypes.byref(sums))
+    return A, g, cost, r, line
+
+
 @torch.library.custom_op("torchrod::normal_equations", mutates_args=(), device_types="cpu")
 def normal_equations(
     x: Tensor, tensors: list[Tensor], counts: list[int], numbers: list[float]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """H^T W H (B, 2, n, n), H^T W r (B, 2, n) and r^T W r (B, 2) of the markers and of the tip residual; r (B, z); centre line."""
-    B, n, P = len(x), x.shape[-1], _outputs(counts)
-    A, g, cost = x.new_empty(B, 2, n, n), x.new_empty(B, 2, n), x.new_empty(B, 2)
-    r, line = x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
-    fit, sums, x = _structure(tensors, counts, numbers), CSums(), x.contiguous()
-    fill(sums, {"A": A, "g": g, "cost": cost, "r": r, "line": line}, {})
-    _run("torchrod_normal", B, ctypes.byref(fit), _at(x), ctypes.c_int64(B), ctypes.byref(sums))
-    return A, g, cost, r, line
+    return normal_equations_now(x, _structure(tensors, counts, numbers), _outputs(counts))
 
 
 @normal_equations.register_fake
@@ -199,21 +218,21 @@ class Sums:
             getattr(self, name)[index] = getattr(other, name)
 
 
-def iterate(
-    tables: FitTables,
-    state: dict[str, Tensor],
-    live: Int[Tensor, " b"],
-    filtering: dict[str, Tensor],
-    limits: dict[str, float | int],
-    sums: Sums,
-) -> None:
-    """One iteration of the filter on the samples `live`, in place: ekf.advance at the normal equations of x.
+class Iteration:
+    """Iterations of the filter on one chunk, in place: ekf.advance at the normal equations of x.
 
     state: x, Sigma, before, cap, done of ekf.Iterate. filtering: Sigma0 (B, n, n), mean, precision and Q (n). limits: those of
     ekf.Limits by name. sums: written for the samples that are done.
     """
-    call, at, live, b = Filter(), CSums(), live.contiguous(), len(live)
-    fill(call, state | filtering, limits)
-    fill(at, vars(sums), {})
-    pointers = [ctypes.byref(x) for x in (tables.structure, call, at)]
-    _run("torchrod_iterate", b, *pointers, _at(live), ctypes.c_int64(b))
+
+    def __init__(self, state: dict[str, Tensor], filtering: dict[str, Tensor], limits: dict[str, float | int], sums: Sums):
+        self._held = (state, filtering, sums)  # the structures hold bare addresses
+        self._filter, self._sums = Filter(), CSums()
+        fill(self._filter, state | filtering, limits)
+        fill(self._sums, vars(sums), {})
+
+    def __call__(self, tables: FitTables, live: Int[Tensor, " b"]) -> None:
+        """One iteration of the samples `live`."""
+        b, live = len(live), live.contiguous()
+        pointers = [ctypes.byref(x) for x in (tables.structure, self._filter, self._sums)]
+        _run("torchrod_iterate", b, *pointers, _at(live), ctypes.c_int64(b))
