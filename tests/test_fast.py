@@ -22,6 +22,7 @@ from torchrod import (
     Rod,
     fast,
     forward_jacobian,
+    march,
     shape_from_base,
     solve_shape,
 )
@@ -133,3 +134,49 @@ assert sum("compiled kernel is not available" in str(w.message) for w in seen) =
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     assert not list(Path(tmp_path).glob("*.so"))
+
+
+@needs_compiler
+def test_a_first_estimate_does_not_wait_for_a_slow_build(tmp_path):
+    """The torch path serves meanwhile, without a word; whoever asks later gets the library."""
+    built = fast.library()
+    assert built is not None
+    compiler = tmp_path / "slow-c++"
+    compiler.write_text(f'#!/bin/sh\nsleep 8\nfor last; do :; done\ncp "{built._name}" "$last"\n')
+    compiler.chmod(0o755)
+    code = """
+import time, warnings, torch
+from torchrod import Robot, Rod, fast, solve_shape
+robot = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), gravity=torch.tensor([9.81, 0.0, 0.0], dtype=torch.float64))
+begun = time.monotonic()
+with warnings.catch_warnings():
+    warnings.filterwarnings("error", message=".*compiled kernel.*")
+    assert not fast.available()
+    assert time.monotonic() - begun < 4
+    shape = solve_shape(robot, (), None, torch.tensor([0.4], dtype=torch.float64), 1, 4)
+assert shape.status[0] == 0
+assert fast.library(wait=True) is not None
+assert fast.available()
+"""
+    environment = {"PATH": "/usr/bin:/bin", "CXX": str(compiler), "TORCHROD_CACHE": str(tmp_path / "cache")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+@pytest.mark.parametrize("backend", ["", "aot_eager"])
+def test_the_torch_path_steps_with_its_tangents(backend, monkeypatch):
+    """Without the kernel, step by step and traced whole, against torch.func through the whole march, tip to base as well."""
+    monkeypatch.setattr(fast, "available", lambda: False)
+    monkeypatch.setenv("TORCHROD_COMPILE", backend)
+    monkeypatch.setattr(march, "_step", march._step.__wrapped__)
+    robot = busy_robot()
+    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale), steps=4)
+    markers = Markers(T([0.1, 0.4]), torch.zeros(3, 2, 3), 0.01 * torch.eye(2, 3), TENSION)
+    x = 0.3 * torch.randn(3, model.size, generator=torch.Generator().manual_seed(1))
+    h, H = model.linearized(x, markers)
+    reference_h, reference_H = forward_jacobian(lambda x: model.h(x, markers), x)
+    assert close(h, reference_h)
+    assert close(H, reference_H)
+    points = PointForces(T([[[0.3, 0.1, 0.0]], [[0.2, 0.4, 0.0]], [[0.0, 0.1, 0.0]]]), T([[0.11], [0.29], [0.4]]))
+    assert (solve_shape(robot, (points,), TENSION, markers.s, 3, 4).status == 0).all()

@@ -1,19 +1,23 @@
 """Walk the arc-length step along the rod, and carry tangents with it.
 
 `march` is the definition, in torch, for any transform. `march_linearized` returns the states at chosen nodes together with their
-derivatives along given tangents: by the compiled kernel where it serves (torchrod.fast), else by torch.func on `march`. Both
-differentiate the discrete steps, so they agree to round-off.
+derivatives along given tangents: by the compiled kernel where it serves (torchrod.fast), else by torch.func on
+each step, which torch.compile can trace. All differentiate the discrete steps, so they agree to round-off.
 """
 
+import os
+from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.func import jvp, vmap
 
 from . import fast
 from .grid import Grid
-from .jacobian import forward_jacobian
+from .lie import Vector
 from .step import Section, StageTable, State, rk4_step
 
 
@@ -58,17 +62,59 @@ def march_linearized(
     """
     if compiled(section, y0):
         return fast.march_linearized(section, y0, dy0, table, dlocal, grid, keep, reverse)
-    if dy0.shape[-1] == 0:
-        states = states_at(march(section, y0, table, grid, reverse), keep)
-        return states, states.new_zeros(*states.shape, 0)
+    n, h = dy0.shape[-1], grid.h
+    table = table.reversed() if reverse else table
+    if dlocal is not None:
+        dlocal = torch.nn.functional.pad(dlocal, (0, n - dlocal.shape[-1])).movedim(-1, 0)
+        dlocal = dlocal.flip(-2) if reverse else dlocal
+    y, dy, steps = y0, dy0.movedim(-1, 0), range(h.shape[-1])
+    states, tangents = [y], [dy]
+    for i in reversed(steps) if reverse else steps:
+        length = (-h[..., i] if reverse else h[..., i]).expand(y.shape[:-1])
+        dG = None if dlocal is None else dlocal[:, :, i]
+        y, dy = _step()(section, y, dy, table.step(i), dG, length) if n else (rk4_step(section, y, table.step(i), length), dy)
+        states.append(y)
+        tangents.append(dy)
+    if reverse:
+        states, tangents = states[::-1], tangents[::-1]
+    kept = states_at(torch.stack(tangents, -2).movedim(0, -1).flatten(-2), keep)
+    return states_at(torch.stack(states, -2), keep), kept.unflatten(-1, (13, n))
 
-    def moved(e: Float[Tensor, "B n"]) -> Float[Tensor, "B P13"]:
-        here = table
-        if dlocal is not None and table.loads.G is not None and table.loads.G2 is not None:
-            d = (dlocal * e[:, None, None, None, : dlocal.shape[-1]]).sum(-1)
-            here = replace(table, loads=replace(table.loads, G=table.loads.G + d[..., :3], G2=table.loads.G2 + d[..., 3:]))
-        states = march(section, y0 + (dy0 * e.unsqueeze(-2)).sum(-1), here, grid, reverse)
-        return states_at(states, keep).flatten(-2)
 
-    value, tangents = forward_jacobian(moved, torch.zeros(len(y0), dy0.shape[-1], dtype=y0.dtype))
-    return value.unflatten(-1, (-1, 13)), tangents.unflatten(-2, (-1, 13))
+def step_with_tangents(
+    section: Section,
+    y: State,
+    dy: Float[Tensor, "n B 13"],
+    table: StageTable,
+    dlocal: Float[Tensor, "n B 3 6"] | None,
+    h: Float[Tensor, " B"],
+) -> tuple[State, Float[Tensor, "n B 13"]]:
+    """One step and its derivatives along n tangents, which move the state by dy and the local loads [G, G2] by dlocal."""
+    known = table.loads
+
+    def column(dy: State, d: Float[Tensor, "B 3 6"] | None) -> tuple[State, State]:
+        if d is None or known.G is None or known.G2 is None:
+            value, tangent, *_ = jvp(lambda y: rk4_step(section, y, table, h), (y,), (dy,))
+            return value, tangent
+
+        def step(y: State, G: Vector, G2: Vector) -> State:
+            return rk4_step(section, y, replace(table, loads=replace(known, G=G, G2=G2)), h)
+
+        # Copies: torch.compile asserts that a dual number's parts lie alike in memory.
+        at = [x.expand(*y.shape[:-1], 3, 3).clone() for x in (known.G, known.G2)]
+        value, tangent, *_ = jvp(step, (y, *at), (dy, d[..., :3].clone(), d[..., 3:].clone()))
+        return value, tangent
+
+    axes = (0, None if dlocal is None else 0)
+    return vmap(column, in_dims=axes, out_dims=(None, 0))(dy, dlocal)  # pyright: ignore[reportArgumentType]
+
+
+@lru_cache(maxsize=1)
+def _step() -> Callable[..., tuple[State, Float[Tensor, "n B 13"]]]:
+    """step_with_tangents, compiled whole by torch.compile where TORCHROD_COMPILE names a backend (inductor).
+
+    That is the portable path, for a GPU or a machine without a C++ compiler of its own: half a minute for each new batch size,
+    robot and family of loads, kept in torch's own cache on disk, then about fourteen times as fast (docs/performance.md).
+    """
+    backend = os.environ.get("TORCHROD_COMPILE", "")
+    return torch.compile(step_with_tangents, fullgraph=True, dynamic=False, backend=backend) if backend else step_with_tangents
