@@ -25,6 +25,7 @@ LAYERS = [
     {"probe"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
+    {"profile"},
     {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},
     {"march"},

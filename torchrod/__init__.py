@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .observability import Observability, bounds, load_bound
     from .placement import Placement, place
     from .plot import draw, draw_on
+    from .profile import Profile, load_profile
     from .result import Estimate, Fit
     from .robot import Robot
     from .rod import Rod
@@ -54,6 +55,7 @@ _HOMES = {
     "observability": ("Observability", "bounds", "load_bound"),
     "placement": ("Placement", "place"),
     "plot": ("draw", "draw_on"),
+    "profile": ("Profile", "load_profile"),
     "result": ("Estimate", "Fit"),
     "robot": ("Robot",),
     "rod": ("Rod",),
@@ -85,6 +87,7 @@ __all__ = [
     "PointForces",
     "PointWrenches",
     "PolynomialLoads",
+    "Profile",
     "Robot",
     "Rod",
     "Settings",
@@ -104,6 +107,7 @@ __all__ = [
     "find_warm_start",
     "forward_jacobian",
     "load_bound",
+    "load_profile",
     "paper_settings",
     "place",
     "read_dataset",

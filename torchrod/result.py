@@ -14,6 +14,7 @@ from .coordinates import LoadReport
 from .jacobian import forward_jacobian
 from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from .measurement import Markers, Model
+from .profile import Profile
 from .status import Learned, Status
 
 if TYPE_CHECKING:
@@ -69,10 +70,16 @@ class Estimate:
     @property
     def magnitude_std(self) -> Float[Tensor, "B K"]:
         """Standard deviation of |F| (N), along the force's direction; where there is no force, of one component."""
-        C = self.load_covariance[..., :2, :2]
+        return self.magnitude_location_covariance[..., 0, 0].clamp(min=0).sqrt()
+
+    @property
+    def magnitude_location_covariance(self) -> Float[Tensor, "B K 2 2"]:
+        """Covariance of (|F|, location) [N^2, N m; N m, m^2], |F| as in magnitude_std."""
         size = self.magnitude.unsqueeze(-1)
         along = torch.where(size > 0, self.force / size, torch.full_like(self.force, 0.5**0.5))
-        return (along.unsqueeze(-2) @ C @ along.unsqueeze(-1)).squeeze(-1).squeeze(-1).clamp(min=0).sqrt()
+        zero = torch.zeros_like(size)
+        J = torch.stack([torch.cat([along, zero], -1), torch.cat([zero, zero, zero + 1], -1)], -2)
+        return J @ self.load_covariance[..., :3, :3] @ J.mT
 
     @property
     def location_std(self) -> Float[Tensor, "B K"]:
@@ -122,13 +129,14 @@ class Estimate:
             )
         return status.message
 
-    def fit(self, sample: int) -> "Fit":
-        """What a figure needs of one sample."""
+    def fit(self, sample: int, profile: Profile | None = None) -> "Fit":
+        """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""
         zeta = None if self.registration is None else self.registration[sample]
         there = torch.isfinite(self.location[sample])
         tip = None if self.tip is None else self.tip[sample, :3]
         loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
-        return Fit(*loads, self.base_wrench[sample], zeta, tip)
+        interval, along = self.location_interval[sample][there], None if profile is None else profile.of(sample)
+        return Fit(*loads, self.base_wrench[sample], zeta, tip, interval, along)
 
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
         """With the samples of `index` replaced by those of another attempt where that is better; every attempt is counted.
@@ -174,8 +182,9 @@ class Evidence:
 @dataclass(frozen=True)
 class Fit:
     """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
-    wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, and the unknown
-    force (3,) N at the tip in the base frame, or None.
+    wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, the unknown
+    force (3,) N at the tip in the base frame, or None, the 95 % intervals (K, 2) m of the locations, NaN where they are not
+    known, and the load profile with its band; both None where only the shape is to be drawn.
     """
 
     force: Float[Tensor, "K 2"]
@@ -184,6 +193,8 @@ class Fit:
     base_wrench: Float[Tensor, " 6"]
     registration: Float[Tensor, " 6"] | None = None
     tip_force: Float[Tensor, " 3"] | None = None
+    location_interval: Float[Tensor, "K 2"] | None = None
+    profile: Profile | None = None
 
     def loads(self, length: float) -> tuple[Load, ...]:
         """The loads as torchrod.loads has them."""
