@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .dataset import DatasetSpec, simulate_shard
     from .errors import InputError
     from .estimator import Settings, estimate, paper_settings
+    from .fit import Fit
     from .io import Dataset, Shapes, read_dataset, read_dataset_spec, read_robot, read_shapes, write_result, write_shapes
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
     from .observability import Observability, bounds, load_bound
     from .placement import Placement, place
     from .plot import draw, draw_on
-    from .result import Estimate, Fit
+    from .profile import Profile, load_profile
+    from .result import Estimate
     from .robot import Robot
     from .rod import Rod
     from .starts import Start, cold_start
@@ -39,6 +41,7 @@ _HOMES = {
     "dataset": ("DatasetSpec", "simulate_shard"),
     "errors": ("InputError",),
     "estimator": ("Settings", "estimate", "paper_settings"),
+    "fit": ("Fit",),
     "io": (
         "Dataset",
         "Shapes",
@@ -55,7 +58,8 @@ _HOMES = {
     "observability": ("Observability", "bounds", "load_bound"),
     "placement": ("Placement", "place"),
     "plot": ("draw", "draw_on"),
-    "result": ("Estimate", "Fit"),
+    "profile": ("Profile", "load_profile"),
+    "result": ("Estimate",),
     "robot": ("Robot",),
     "rod": ("Rod",),
     "starts": ("Start", "cold_start"),
@@ -88,6 +92,7 @@ __all__ = [
     "PointForces",
     "PointWrenches",
     "PolynomialLoads",
+    "Profile",
     "Robot",
     "Rod",
     "Settings",
@@ -107,6 +112,7 @@ __all__ = [
     "find_warm_start",
     "forward_jacobian",
     "load_bound",
+    "load_profile",
     "paper_settings",
     "place",
     "read_dataset",

@@ -24,6 +24,7 @@ from .io import (
 )
 from .measurement import Markers, Model
 from .observability_command import observability
+from .profile import Profile, joined_profile
 from .result import Estimate
 from .robot import Robot
 from .selection import Hypothesis, select
@@ -86,10 +87,14 @@ def estimate(options: Namespace) -> None:
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     print(_report(result, shapes.samples))  # noqa: T201
-    if options.out:
-        write_result(options.out, result, shapes.samples, robot.name, evidence)
-    if options.plot:
-        _draw(options.plot, robot, shapes.markers, result, shapes.samples)
+    if options.out or options.plot:
+        everyone = torch.zeros(len(shapes.samples), dtype=torch.int64) if evidence is None else evidence.choice
+        fitted_by = [(c.model, (everyone == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
+        profile = joined_profile(fitted_by, result.x, result.covariance)
+        if options.out:
+            write_result(options.out, result, shapes.samples, robot.name, evidence, profile)
+        if options.plot:
+            _draw(options.plot, robot, shapes.markers, result, shapes.samples, profile)
 
 
 def _hypotheses(options: Namespace, count: int | None, model: Callable[[int, str, str], Model]) -> list[Hypothesis]:
@@ -162,7 +167,7 @@ def _moment(values: list[str]) -> str:
     return f"; moment (N m) {', '.join(values)}" if values else ""
 
 
-def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: list[str]) -> None:
+def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: list[str], profile: Profile | None) -> None:
     from .plot import draw
 
     drawable = torch.isfinite(result.base_wrench).all(-1).nonzero().flatten().tolist()
@@ -170,7 +175,7 @@ def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: 
         warnings.warn(f"{path}: not written, because no sample has a fit to draw", stacklevel=2)
         return
     b = drawable[0]
-    draw(path, robot, result.fit(b), markers, b, f"{robot.name}, sample {samples[b]}: {result.message(b)}")
+    draw(path, robot, result.fit(b, profile), markers, b, f"{robot.name}, sample {samples[b]}: {result.message(b)}")
 
 
 def plot(options: Namespace) -> None:

@@ -2,21 +2,23 @@
 
 import math
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
+from .fit import Fit
 from .grid import DEFAULT_STEPS
 from .lie import move, rotate
 from .measurement import Markers
-from .result import Fit
 from .robot import Robot
 from .rod import DTYPE
 from .statics import shape_from_base
@@ -24,6 +26,7 @@ from .statics import shape_from_base
 INK, LOAD, MARKER, TENDON, TRUTH = "#1b2a41", "#c8102e", "#0a7f8c", "#9a9a9a", "#b5b5b5"
 ARROW = 0.28  # the largest net force is drawn this long, in rod lengths
 ENVELOPE = 0.12  # and the densest load this high
+ROW_FROM, ROW = 0.8, 0.9  # of the height of |f|: what the curves may take, and where the contacts' locations stand
 
 
 @dataclass(frozen=True)
@@ -148,13 +151,61 @@ def draw_on(axes: Axes3D, robot: Robot, fit: Fit, markers: Markers, sample: int,
     _look_across(axes, torch.cat([torch.stack([chord, *bent]), vectors]))
 
 
+def _stems(axes: Axes, at: Float[Tensor, " K"], value: Float[Tensor, " K"]) -> None:
+    """Point forces: a stem each."""
+    axes.vlines(1e3 * at, 0, value, color=LOAD, lw=2)
+    axes.plot(1e3 * at, value, "o", color=LOAD, ms=6)
+
+
+def _where(axes: Axes, fit: Fit) -> None:
+    """The contacts and the 95 % intervals of their locations, in a row above the curves."""
+    at = 1e3 * fit.location
+    interval = torch.full_like(at, torch.nan).unsqueeze(-1) if fit.location_interval is None else 1e3 * fit.location_interval
+    reach = (at.unsqueeze(-1) - interval).abs().nan_to_num(0.0).T
+    across = axes.get_xaxis_transform()
+    look = {"fmt": "o", "color": INK, "ms": 6, "capsize": 5, "lw": 1.8, "transform": across, "clip_on": False}
+    axes.errorbar(at, torch.full_like(at, ROW), xerr=reach.numpy(), label="contact location, 95 %", **look)
+
+
+def draw_profile_on(axes: Sequence[Axes], fit: Fit, length: float) -> None:
+    """f_x, f_y and |f| along the rod (N/m), section frame, in three axes one above the other, each with its 95 % band.
+
+    Above |f| the contacts with the intervals of their locations. Point forces (no profile) are stems (N). length: L (m).
+    """
+    sizes = torch.cat([fit.force, fit.force.norm(dim=-1, keepdim=True)], -1)
+    for i, (panel, name) in enumerate(zip(axes, ("$f_x$", "$f_y$", "$|f|$"), strict=True)):
+        panel.axhline(0, color="#9a9a9a", lw=0.8)
+        if fit.profile is None:
+            _stems(panel, fit.location, sizes[:, i])
+        else:
+            s, f = 1e3 * fit.profile.s, torch.cat([fit.profile.f, fit.profile.f.norm(dim=-1, keepdim=True)], -1)
+            panel.fill_between(
+                s, fit.profile.band[:, i, 0], fit.profile.band[:, i, 1], color=LOAD, alpha=0.2, lw=0, label="95 % band"
+            )
+            panel.plot(s, f[:, i], color=LOAD, lw=2, label="load per length")
+        panel.set_ylabel(f"{name} ({'N' if fit.profile is None else 'N/m'})", fontsize=12)
+        panel.grid(alpha=0.3)
+        panel.set_xlim(0, 1e3 * length)
+        panel.tick_params(labelbottom=panel is axes[-1], labelsize=10)
+    low, high = axes[-1].get_ylim()
+    axes[-1].set_ylim(low, low + (high - low) / ROW_FROM)
+    if len(fit.force):
+        _where(axes[-1], fit)
+    axes[-1].set_xlabel("arc length from the base, s (mm)", fontsize=12)
+
+
 def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int, title: str) -> None:
-    """Write the figure of one sample, by `draw_on`."""
-    figure = Figure(figsize=(8, 7), layout="constrained")
+    """Write the figure of one sample: the rod by `draw_on`, and beside it the loads along it by `draw_profile_on`."""
+    figure = Figure(figsize=(13, 7), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot(projection="3d")
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
+    axes = figure.add_subplot(grid[:, 0], projection="3d")
     assert isinstance(axes, Axes3D)
     draw_on(axes, robot, fit, markers, sample)
-    axes.set_title(textwrap.fill(title, 80), fontsize=12)
-    figure.legend(loc="outside lower center", ncols=6, frameon=False)
+    panels = [figure.add_subplot(grid[i, 1]) for i in range(3)]
+    draw_profile_on(panels, fit, robot.rod.length)
+    figure.suptitle(textwrap.fill(title, 120), fontsize=13)
+    names = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    names |= dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
+    figure.legend(names.values(), names.keys(), loc="outside lower center", ncols=5, frameon=False, fontsize=11)
     figure.savefig(path, dpi=150)

@@ -1,6 +1,5 @@
 """The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
 
-import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
@@ -12,10 +11,11 @@ from torch import Tensor
 from . import ekf
 from .coordinates import LoadReport
 from .fast import Sums
+from .fit import Fit
 from .jacobian import pointwise_jacobian
-from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from .measurement import TIP_EXACT, Model
 from .prepared import Prepared
+from .profile import Profile
 from .status import Learned, Status
 
 Z95 = 1.959964  # of the standard normal distribution
@@ -68,10 +68,16 @@ class Estimate:
     @property
     def magnitude_std(self) -> Float[Tensor, "B K"]:
         """Standard deviation of |F| (N), along the force's direction; where there is no force, of one component."""
-        C = self.load_covariance[..., :2, :2]
+        return self.magnitude_location_covariance[..., 0, 0].clamp(min=0).sqrt()
+
+    @property
+    def magnitude_location_covariance(self) -> Float[Tensor, "B K 2 2"]:
+        """Covariance of (|F|, location) [N^2, N m; N m, m^2], |F| as in magnitude_std."""
         size = self.magnitude.unsqueeze(-1)
         along = torch.where(size > 0, self.force / size, torch.full_like(self.force, 0.5**0.5))
-        return (along.unsqueeze(-2) @ C @ along.unsqueeze(-1)).squeeze(-1).squeeze(-1).clamp(min=0).sqrt()
+        zero = torch.zeros_like(size)
+        J = torch.stack([torch.cat([along, zero], -1), torch.cat([zero, zero, zero + 1], -1)], -2)
+        return J @ self.load_covariance[..., :3, :3] @ J.mT
 
     @property
     def location_std(self) -> Float[Tensor, "B K"]:
@@ -121,13 +127,14 @@ class Estimate:
             )
         return status.message
 
-    def fit(self, sample: int) -> "Fit":
-        """What a figure needs of one sample."""
+    def fit(self, sample: int, profile: Profile | None = None) -> Fit:
+        """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""
         zeta = None if self.registration is None else self.registration[sample]
         there = torch.isfinite(self.location[sample])
         tip = None if self.tip is None else self.tip[sample, :3]
         loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
-        return Fit(*loads, self.base_wrench[sample], zeta, tip)
+        interval, along = self.location_interval[sample][there], None if profile is None else profile.of(sample)
+        return Fit(*loads, self.base_wrench[sample], zeta, tip, interval, along)
 
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
         """With the samples of `index` replaced by those of another attempt where that is better; every attempt is counted.
@@ -156,42 +163,6 @@ class Estimate:
             return torch.cat(present) if present else None
 
         return Estimate(**{f.name: joined([getattr(p, f.name) for p in parts]) for f in fields(Estimate)})  # pyright: ignore[reportArgumentType]
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What speaks for each hypothesis: names (H); bic (B, H), chi^2 + k ln(n), of which the least is chosen; choice (B,), an index.
-
-    NaN where a hypothesis was not needed, inf where its fit did not converge.
-    """
-
-    names: tuple[str, ...]
-    choice: Int[Tensor, " B"]
-    bic: Float[Tensor, "B H"]
-
-
-@dataclass(frozen=True)
-class Fit:
-    """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
-    wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, and the unknown
-    force (3,) N at the tip in the base frame, or None.
-    """
-
-    force: Float[Tensor, "K 2"]
-    location: Float[Tensor, " K"]
-    width: Float[Tensor, " K"]
-    base_wrench: Float[Tensor, " 6"]
-    registration: Float[Tensor, " 6"] | None = None
-    tip_force: Float[Tensor, " 3"] | None = None
-
-    def loads(self, length: float) -> tuple[Load, ...]:
-        """The loads as torchrod.loads has them."""
-        point = self.width <= 0
-        c = 0.5 / self.width[~point] ** 2
-        spread = (math.pi / c).sqrt() * on_rod_fraction(self.location[~point], c, length)
-        force = torch.cat([self.force, torch.zeros_like(self.force[:, :1])], -1)
-        smooth = GaussianLoads(self.force[~point] / spread.unsqueeze(-1), self.location[~point], c)
-        return (smooth, PointForces(force[point], self.location[point]))
 
 
 def _interval(value: Float[Tensor, "B K"], std: Float[Tensor, "B K"]) -> Float[Tensor, "B K 2"]:

@@ -15,9 +15,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .estimator import Settings, estimate
+from .fit import Evidence
 from .measurement import Markers, Model
 from .probe import probe, start_with_one_more
-from .result import Estimate, Evidence
+from .result import Estimate
 from .starts import Start, StartRule
 from .status import Status
 

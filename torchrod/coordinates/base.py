@@ -59,6 +59,13 @@ class LoadCoordinates(Protocol):
         """The same loads with other magnitudes: where to try again when a fit is not accepted."""
         ...
 
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma moved by a draw `step` of its uncertainty, along curves on which the posterior is most nearly Gaussian.
+
+        gamma + step to first order; std: the standard deviation of every entry.
+        """
+        ...
+
     def describe(self, gamma: Gamma) -> LoadReport:
         """Force, location and width of each load."""
         ...

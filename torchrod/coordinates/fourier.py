@@ -46,6 +46,10 @@ class FourierCoordinates:
         """Coefficients times the factor."""
         return factor * gamma
 
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma + step: the density is linear in the coefficients."""
+        return gamma + step
+
     def describe(self, gamma: Gamma) -> LoadReport:
         """The whole series as one load: its net force, its centroid (by |f|) and the spread about it."""
         (load,) = self.loads(gamma)

@@ -13,6 +13,8 @@ from .base import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
 
 WIDTH_OF_PRIOR = {"point": 1 / 100, "contact": 1 / 40, "distributed": 1 / 4}  # sigma / L: 4, 10 and 100 mm on the paper's rod
 LOG_C_STD = 1.0  # of the weak prior on log c
+KNOWN = 0.5  # a force or a place with less relative error than this is known well enough for its logarithm to have one
+SPREAD_LIMIT = 10.0  # of log |F|: what is drawn beyond it is not used, and must not overflow
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,27 @@ class GaussianCoordinates:
         each = gamma.unflatten(-1, (self.count, self.per_load))
         eta = each[..., 2:-1].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
         return torch.cat([factor * each[..., :2], eta, torch.full_like(each[..., -1:], self._log_c())], -1).flatten(-2)
+
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma + step where a force or a place is hardly known; else along [log |F|, direction, log location, log c].
+
+        A push nearer the base looks like a weaker one farther out: the posterior is a banana in newtons and metres and more nearly
+        an ellipse in these logarithms.
+        """
+        each, by, std = (v.unflatten(-1, (self.count, self.per_load)) for v in torch.broadcast_tensors(gamma, step, std))
+        F, dF = each[..., :2], by[..., :2]
+        size = F.norm(dim=-1, keepdim=True).clamp(min=1e-300)
+        along, across = F / size, torch.stack([-F[..., 1], F[..., 0]], -1) / size
+        growth, turn = ((dF * e).sum(-1, keepdim=True) / size for e in (along, across))
+        curved = size * growth.clamp(max=SPREAD_LIMIT).exp() * (turn.cos() * along + turn.sin() * across)
+        sure = std[..., :2].norm(dim=-1, keepdim=True) < KNOWN * size
+        parts = [torch.where(sure, curved, F + dF), each[..., 2:] + by[..., 2:]]
+        if self.locations is None:
+            place = torch.sigmoid(each[..., 2:3])
+            farther = (place * torch.exp((1 - place) * by[..., 2:3])).clamp(1e-6, 1 - 1e-6)
+            sure = (1 - place) * std[..., 2:3] < KNOWN
+            parts[1:] = [torch.where(sure, torch.logit(farther), parts[1][..., :1]), parts[1][..., 1:]]
+        return torch.cat(parts, -1).flatten(-2)
 
     def _log_c(self) -> float:
         name = "contact" if self.prior_name == "none" else self.prior_name

@@ -44,6 +44,12 @@ class PaperCoordinates:
         """Amplitudes times the factor."""
         return (gamma.unflatten(-1, (self.count, 4)) * gamma.new_tensor([factor, factor, 1.0, 1.0])).flatten(-2)
 
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma + step, but c by its logarithm: it is positive."""
+        each, by = gamma.unflatten(-1, (self.count, 4)), step.unflatten(-1, (self.count, 4))
+        c = each[..., 3:] * torch.exp(by[..., 3:] / each[..., 3:])
+        return torch.cat([each[..., :3] + by[..., :3], c], -1).flatten(-2)
+
     def describe(self, gamma: Gamma) -> LoadReport:
         """The net force by (13), mu and sigma."""
         each = gamma.unflatten(-1, (self.count, 4))

@@ -42,6 +42,10 @@ class PointCoordinates:
         eta = each[..., 2:].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
         return torch.cat([factor * each[..., :2], eta], -1).flatten(-2)
 
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma + step."""
+        return gamma + step
+
     def describe(self, gamma: Gamma) -> LoadReport:
         """Force, point of application, width zero."""
         each = gamma.unflatten(-1, (self.count, self.per_load))

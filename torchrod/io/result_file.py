@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..errors import InputError
-from ..result import Estimate, Evidence, Fit
+from ..fit import Evidence, Fit
+from ..profile import Profile
+from ..result import Estimate
 from ..status import Status
 
 RESULT_SUFFIXES = (".json", ".npz")
@@ -24,6 +27,7 @@ def _plain(value: float) -> float | None:
 
 def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
     force, net = estimate.force[b].tolist(), estimate.net_force[b].tolist()
+    pair = estimate.magnitude_location_covariance[b]
     return [
         {
             "force_local_N": [_plain(v) for v in force[k]],
@@ -31,6 +35,7 @@ def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
             "location_m": _plain(float(estimate.location[b, k])),
             "width_m": _plain(float(estimate.width[b, k])),
             "net_force_local_N": [_plain(v) for v in net[k]],
+            "covariance": [[_plain(v) for v in row] for row in pair[k].tolist()],
             "std": {
                 "magnitude_N": _plain(float(estimate.magnitude_std[b, k])),
                 "location_m": _plain(float(estimate.location_std[b, k])),
@@ -74,15 +79,40 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     return record
 
 
+def _rounded(value: Tensor, largest: float) -> list[object]:
+    """Numbers for a person to read, to five digits of the largest; null for the unknown."""
+    if value.ndim > 1:
+        return [_rounded(v, largest) for v in value]
+    places = 5 - math.ceil(math.log10(largest)) if largest > 0 else 0
+    return [round(v, places) + 0.0 if math.isfinite(v) else None for v in value.tolist()]
+
+
+def _profile(profile: Profile) -> str:
+    """The load profile of one sample on one line: a number to a line would be 800 lines."""
+    largest = float(torch.cat([profile.f.flatten(), profile.band.flatten()]).nan_to_num(0.0).abs().max())
+    band = {name: _rounded(profile.band[:, i], largest) for i, name in enumerate(("fx", "fy", "magnitude"))}
+    f = _rounded(profile.f, largest)
+    known = f[0] is not None and bool(torch.isfinite(profile.f).all())
+    content = {"s_m": _rounded(profile.s, float(profile.s.max())), "f_local_N_per_m": f, "band_95": band}
+    return json.dumps(content if known else None, separators=(",", ":"))
+
+
 def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
     bic = {name: _plain(value) for name, value in zip(evidence.names, evidence.bic[b].tolist(), strict=True)}
     return {"chosen": evidence.names[int(evidence.choice[b])], "bic": bic}
 
 
-def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot: str, evidence: Evidence | None = None) -> None:
+def write_result(
+    path: str | Path,
+    estimate: Estimate,
+    samples: list[str],
+    robot: str,
+    evidence: Evidence | None = None,
+    profile: Profile | None = None,
+) -> None:
     """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix.
 
-    evidence: for each number of loads, where it was chosen from the data.
+    evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
@@ -91,12 +121,18 @@ def write_result(path: str | Path, estimate: Estimate, samples: list[str], robot
         records = [result_record(estimate, b, name) for b, name in enumerate(samples)]
         for b, record in enumerate(records if evidence is not None else ()):
             record["evidence"] = _evidence(evidence, b)  # pyright: ignore[reportArgumentType]
-        content = {"robot": robot, "results": records}
-        path.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        texts = [json.dumps(record, indent=1) for record in records]
+        if profile is not None:
+            texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
+        path.write_text(f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n", encoding="utf-8")
         return
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic}
+    for name in ("magnitude_location_covariance", "location_interval"):
+        arrays[name] = getattr(estimate, name)
+    if profile is not None:
+        arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
     np.savez_compressed(
         path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}
     )
@@ -108,38 +144,65 @@ def _index(path: Path, names: list[str], sample: str) -> int:
     return names.index(sample)
 
 
+def _arrays_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
+    """What a figure needs of a RESULT.npz: force, location, width, base wrench, registration, tip force, intervals; the profile."""
+    with np.load(path, allow_pickle=False) as file:
+        b = _index(path, [str(n) for n in file["sample"]], sample)
+        values: list[object] = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
+        values.append(file["registration"][b] if "registration" in file else None)
+        values.append(file["tip"][b][:3] if "tip" in file else None)
+        values.append(file["location_interval"][b] if "location_interval" in file else None)
+        if "profile_f" not in file:
+            return values, None
+        return values, [file["profile_s"], file["profile_f"][b], file["profile_band"][b]]
+
+
+def _record_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
+    """The same of a RESULT.json."""
+    results = json.loads(path.read_text(encoding="utf-8"))["results"]
+    record = results[_index(path, [str(r["sample"]) for r in results], sample)]
+    loads, wrench = record["loads"], record["base_wrench"]
+    values: list[object] = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
+    values.append([*wrench["force_N"], *wrench["moment_Nm"]])
+    twist = record.get("registration")
+    values.append(None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]])
+    values.append(record["tip"]["force_N"] if "tip" in record else None)
+    values.append([load["interval_95"]["location_m"] for load in loads])
+    profile = record.get("profile")
+    if profile is None:
+        return values, None
+    band = np.stack([np.array(profile["band_95"][key], dtype=float) for key in ("fx", "fy", "magnitude")], 1)
+    return values, [profile["s_m"], profile["f_local_N_per_m"], band]
+
+
 def read_fit(path: str | Path, sample: str) -> Fit:
     """One sample of a RESULT.json or RESULT.npz. Errors: InputError naming file, sample and remedy."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
     try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                names = [str(n) for n in file["sample"]]
-                b = _index(path, names, sample)
-                values = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
-                zeta = file["registration"][b] if "registration" in file else None
-                tip = file["tip"][b][:3] if "tip" in file else None
-        else:
-            results = json.loads(path.read_text(encoding="utf-8"))["results"]
-            names = [str(r["sample"]) for r in results]
-            record = results[_index(path, names, sample)]
-            loads, wrench = record["loads"], record["base_wrench"]
-            values = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
-            values.append([*wrench["force_N"], *wrench["moment_Nm"]])
-            twist = record.get("registration")
-            zeta = None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]]
-            tip = record["tip"]["force_N"] if "tip" in record else None
-        tensors = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in (*values, zeta, tip)]
+        values, stored = (_arrays_of if path.suffix == ".npz" else _record_of)(path, sample)
+        *loads, wrench, zeta, tip, interval = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in values]
+        profile = None if stored is None else Profile(*(torch.tensor(np.array(v, dtype=float)) for v in stored))
+        force, location, width = (t.reshape(-1, 2) if i == 0 else t for i, t in enumerate(loads) if t is not None)
+        there = torch.isfinite(force).all(-1)
+        loads = [force[there], location[there], width[there]]
+        interval = None if interval is None else interval.reshape(-1, 2)[there]
     except InputError:
         raise
-    except (KeyError, TypeError, ValueError, AttributeError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        IndexError,
+        AttributeError,
+        EOFError,
+        OSError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise InputError(f"{path}: is not a result of torchrod estimate ({error}); write it with --out") from None
-    force, location, width, *rest = tensors
-    assert force is not None and location is not None and width is not None
-    there = torch.isfinite(force.reshape(-1, 2)).all(-1)
-    loads = [force.reshape(-1, 2)[there], location[there], width[there]]
-    if not all(bool(torch.isfinite(t).all()) for t in [*loads, *rest] if t is not None):
+    if not all(bool(torch.isfinite(t).all()) for t in [*loads, wrench, zeta, tip] if t is not None):
         raise InputError(f"{path}: sample {sample} has no fit to draw; see its message")
-    return Fit(*loads, *rest)  # pyright: ignore[reportArgumentType]
+    assert wrench is not None
+    return Fit(loads[0], loads[1], loads[2], wrench, zeta, tip, interval, profile)

@@ -1,0 +1,139 @@
+"""The load profile: what it is for every family, how often its band holds the truth, and its way through files and figures."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.conftest import reference
+from tests.robots import T, csv_of, steel_rod, toml_of
+from torchrod import (
+    FourierCoordinates,
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PointCoordinates,
+    PointForces,
+    Settings,
+    estimate,
+    load_profile,
+    solve_shape,
+)
+from torchrod.cli import main
+from torchrod.profile import joined_profile
+
+S20 = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
+
+
+def contact(force: list[float], place: float) -> Markers:
+    shape = solve_shape(steel_rod(), (PointForces(T([[[*force, 0.0]]]), T([[place]])),), None, S20, 1)
+    return Markers(S20, shape.p)
+
+
+def drawn(count: int) -> tuple[Model, torch.Tensor, Markers]:
+    """Contacts as the prior has them, with 1 mm noise."""
+    robot, generator = steel_rod(), torch.Generator().manual_seed(5)
+    coordinates = GaussianCoordinates(1, 0.4, robot.rod.force_scale)
+    size, angle, place = torch.rand(3, count, generator=generator)
+    size, angle = (0.5 + 0.5 * size) / robot.rod.force_scale, 2 * math.pi * angle
+    log_c = coordinates.prior()[0][3] + torch.randn(count, generator=generator)
+    gamma = torch.stack([size * angle.cos(), size * angle.sin(), torch.logit(0.25 + 0.7 * place), log_c], -1)
+    p = solve_shape(robot, coordinates.loads(gamma), None, S20, count, 80).p
+    return Model(robot, coordinates), gamma, Markers(S20, p + 1e-3 * torch.randn(p.shape, generator=generator))
+
+
+def test_the_band_holds_the_truth():
+    model, gamma, markers = drawn(200)
+    fit = estimate(model, markers, 1e-3)
+    profile = load_profile(model, fit.x, fit.covariance)
+    assert profile is not None
+    f = model.coordinates.loads(gamma)[0].density(profile.s)
+    assert f is not None
+    truth = torch.cat([f[..., :2], f.norm(dim=-1, keepdim=True)], -1)
+    high = profile.band[..., 2, 1]
+    there = high > 0.05 * high.amax(-1, keepdim=True)
+    held = ((profile.band[..., 0] <= truth) & (truth <= profile.band[..., 1]))[there].double().mean(0)
+    assert (held > 0.91).all()
+    assert (held < 0.99).all()
+    alone = load_profile(model, fit.x[7:8], fit.covariance[7:8])
+    assert alone is not None
+    assert torch.allclose(alone.band[0], profile.band[7], rtol=1e-9, atol=1e-12)
+
+
+def test_a_series_is_its_own_profile_and_points_have_none():
+    robot, markers = steel_rod(), contact([0.5, -0.2], 0.25)
+    model = Model(robot, FourierCoordinates(3, 0.4, robot.rod.force_scale))
+    fit = estimate(model, markers, 1e-4)
+    profile = load_profile(model, fit.x, fit.covariance, 41)
+    assert profile is not None
+    net = torch.trapezoid(profile.f[0], profile.s, dim=0)
+    assert torch.allclose(net, fit.force[0, 0], atol=1e-3)
+    density = model.coordinates.loads(fit.x[:, : model.coordinates.size])[0].density(profile.s)
+    assert density is not None
+    assert torch.allclose(profile.f, density[..., :2])
+    assert (profile.band[..., :2, 0] < profile.f).all()
+    assert (profile.band[..., :2, 1] > profile.f).all()
+    points = Model(robot, PointCoordinates(1, 0.4, robot.rod.force_scale))
+    there = estimate(points, markers, 1e-4)
+    assert load_profile(points, there.x, there.covariance) is None
+    assert joined_profile([(points, torch.arange(1))], there.x, there.covariance) is None
+
+
+def test_no_load_no_band_and_no_knowledge():
+    """Without loads the profile is zero; a fit that has not converged has a profile without a band."""
+    robot, markers = steel_rod(), contact([0.5, -0.2], 0.25)
+    none = Model(robot, GaussianCoordinates(0, 0.4, robot.rod.force_scale))
+    fit = estimate(none, markers, 1e-3)
+    profile = load_profile(none, fit.x, fit.covariance)
+    assert profile is not None
+    assert not profile.band.any()
+    one = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale))
+    hasty = estimate(one, markers, 1e-3, Settings(max_iterations=2, restarts=()))
+    profile = load_profile(one, hasty.x, hasty.covariance)
+    assert profile is not None
+    assert profile.f.isfinite().all()
+    assert profile.band.isnan().all()
+
+
+def test_the_covariance_of_magnitude_and_location():
+    """The diagonal is the reported spread; on this rod a push farther out is weaker, so they are correlated negatively."""
+    model = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
+    fit = estimate(model, contact([0.5, -0.2], 0.25), 1e-3)
+    C = fit.magnitude_location_covariance[0, 0]
+    assert torch.allclose(C.diagonal().sqrt(), torch.stack([fit.magnitude_std[0, 0], fit.location_std[0, 0]]))
+    assert C[0, 1] < 0
+    assert torch.linalg.eigvalsh(C).min() > 0
+
+
+def test_files_and_figures(tmp_path):
+    """JSON and NPZ carry the same profile, on one line, and the figure is drawn from either as it was after the estimate."""
+    case = next(c for c in reference("shape") if c["name"] == "passive-point-0")
+    robot, shape = str(tmp_path / "robot.toml"), str(tmp_path / "shape.csv")
+    Path(robot).write_text(toml_of(case["robot"], "rod"))
+    Path(shape).write_text(csv_of(case))
+    figures = []
+    for out in ("result.json", "result.npz"):
+        figure, result = tmp_path / f"{out}.png", str(tmp_path / out)
+        options = ["--contacts", "auto", "--noise", "1e-3", "--out", result, "--plot", str(tmp_path / "first.png")]
+        assert main(["estimate", robot, shape, *options]) == 0
+        assert main(["plot", robot, shape, result, "--out", str(figure)]) == 0
+        figures.append(figure.read_bytes())
+    assert len(figures[0]) > 50_000
+    text = (tmp_path / "result.json").read_text()
+    assert len(text.splitlines()) < 150
+    (record,) = json.loads(text)["results"]
+    stored = record["profile"]
+    f, band = np.array(stored["f_local_N_per_m"]), stored["band_95"]
+    assert f.shape == (101, 2)
+    assert np.array(band["magnitude"]).shape == (101, 2)
+    with np.load(tmp_path / "result.npz") as arrays:
+        assert np.allclose(arrays["profile_f"][0], f, atol=1e-4 * np.abs(f).max())
+        assert np.allclose(arrays["profile_band"][0, :, 1], band["fy"], atol=1e-4 * np.abs(band["fy"]).max())
+        assert np.allclose(arrays["magnitude_location_covariance"][0, 0], record["loads"][0]["covariance"])
+    peak = stored["s_m"][int(np.linalg.norm(f, axis=1).argmax())]
+    assert abs(peak - record["loads"][0]["location_m"]) < 3e-3
+    del record["profile"]
+    (tmp_path / "old.json").write_text(json.dumps({"robot": "rod", "results": [record]}))
+    assert main(["plot", robot, shape, str(tmp_path / "old.json"), "--out", str(tmp_path / "old.png")]) == 0
