@@ -58,9 +58,9 @@ def close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-10) -> bool:
     return bool((a - b).abs().max() <= relative * b.abs().max())
 
 
-def case(robot: Robot, coordinates, registration: bool, tip: str) -> tuple[Model, Markers, torch.Tensor]:
+def case(robot: Robot, coordinates, registration: bool, tip: str, tension_std=None) -> tuple[Model, Markers, torch.Tensor]:
     """A model somewhere, with markers on stalks one of which is missing."""
-    model = Model(robot, coordinates, registration, steps=10, tip=tip)
+    model = Model(robot, coordinates, registration, steps=10, tip=tip, tension_std=tension_std)
     generator = torch.Generator().manual_seed(1)
     positions = 0.1 * torch.randn(B, 3, 3, generator=generator)
     positions[1, 1] = torch.nan
@@ -71,14 +71,20 @@ def case(robot: Robot, coordinates, registration: bool, tip: str) -> tuple[Model
     return model, Markers(T([0.1, 0.25, 0.4]), positions, 0.01 * torch.eye(3), tension), x
 
 
-@pytest.mark.parametrize(
-    "frame", [(False, "none"), (True, "wrench"), (True, "force")], ids=["", "zeta, tip wrench", "zeta, tip force"]
-)
+FRAMES = {
+    "plain": (False, "none"),
+    "zeta, tip wrench, tensions": (True, "wrench", 0.5),
+    "zeta, tip force": (True, "force"),
+    "tensions": (False, "none", 2.0),
+}
+
+
+@pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_h_jacobian_and_normal_equations(robot, family, frame):
     r = ROBOTS[robot]()
-    model, markers, x = case(r, FAMILIES[family](r.rod.force_scale), *frame)
+    model, markers, x = case(r, FAMILIES[family](r.rod.force_scale), *FRAMES[frame])
     prepared = Prepared(model, markers, model.weights(markers, 1e-3), nu=4.0)
     if family == "points" and robot in ("helical tendons and gravity", "full stiffness"):
         assert not prepared.compiled  # nodes that move under a curvature or a routing that varies: left to torch

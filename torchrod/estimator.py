@@ -1,5 +1,6 @@
 """Estimate loads from markers: iterate the filter on a batch until every sample has settled."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,8 @@ class Settings:
 
     step_limit: the largest change of any entry in one iteration. adaptive: residual-adaptive noise.
     coarse: begin with COARSE_STEPS steps along the rod and end, where the fit is near, with the model's own.
+    robust: degrees of freedom of Student's t, by which the fit goes on from where the normal distribution's has ended; markers far
+    off then weigh little (torchrod.ekf (6)), and those beyond the 99.9 % point are called outliers. inf: the normal one alone.
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
@@ -42,6 +45,7 @@ class Settings:
     coarse: bool = True
     max_iterations: int = 100
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
+    robust: float = math.inf
 
     def initial_covariance(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "n n"]:
         """Sigma0 as a matrix."""
@@ -84,7 +88,7 @@ def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[
 
 def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
     """Samples with a marker, as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
-    enough = 3 * markers.present.sum(-1) >= max(model.size - 6, 1)
+    enough = 3 * markers.present.sum(-1) >= max(model.free_size, 1)
     if markers.tension is not None:
         enough = enough & torch.isfinite(markers.tension).all(-1)
     return enough
@@ -98,7 +102,7 @@ def _filter(
     model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
 ) -> Estimate:
     """Iterate one chunk. Samples leave the batch when they have converged; a failed one never touches its neighbours."""
-    prepared = Prepared(model, markers, model.weights(markers, noise))
+    prepared = Prepared(model, markers, model.weights(markers, noise), settings.robust)
     x = start.x.clone()
     Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
     Sigma0, Q = Sigma0.contiguous(), settings.Q * x.new_ones(model.size)
@@ -153,8 +157,11 @@ def _from_guess(
 def _with_restarts(
     model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
 ) -> Estimate:
-    """One chunk, and again from other magnitudes where the fit is not accepted."""
-    fit = _from_guess(model, markers, noise, settings, start, progress)
+    """One chunk, on with Student's t if so wished, and again from other magnitudes where the fit is not accepted."""
+    fit = _from_guess(model, markers, noise, replace(settings, robust=math.inf), start, progress)
+    if math.isfinite(settings.robust):
+        onward = _filter(model, markers, noise, settings, Start(fit.x.nan_to_num(0.0), None, fit.warm_started), _silent)
+        fit = replace(onward, iterations=fit.iterations + onward.iterations, restarts=fit.restarts, learned=fit.learned)
     again = replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS))
     for factor in settings.restarts if model.coordinates.size else ():
         index = (~fit.accepted & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
@@ -204,9 +211,9 @@ def check(model: Model, markers: Markers, noise: float) -> None:
         raise ValueError("there are no markers; give at least one sample with markers")
     if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + 1e-9)).any()):
         raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
-    if 3 * len(markers.s) < model.size - 6:
+    if 3 * len(markers.s) < model.free_size:
         raise ValueError(
-            f"{len(markers.s)} markers cannot determine {model.size - 6} unknowns; add markers or drop loads or --registration"
+            f"{len(markers.s)} markers cannot determine {model.free_size} unknowns; add markers or drop loads or --registration"
         )
     if tendons and markers.tension is None:
         raise ValueError(f"the robot has {tendons} tendons but the shapes carry no tensions; add tension_1..tension_{tendons}")

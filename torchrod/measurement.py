@@ -1,9 +1,10 @@
 """The measurement: markers on the rod, and the model h(x) of what they show.
 
-    x = [gamma, tip, zeta, alpha]   ->   h(x) = [p_1 .. p_P, c]
+    x = [gamma, tip, theta, zeta, alpha]   ->   h(x) = [p_1 .. p_P, c]
 
-gamma are the loads (torchrod.coordinates), tip an optional unknown wrench at the tip, zeta an optional registration twist, alpha
-the base wrench, c the tip residual: what the section carries just beyond the tip (17), less R^T of the unknown wrench there.
+gamma are the loads (torchrod.coordinates), tip an optional unknown wrench at the tip, theta optional errors of the tensions'
+readings, zeta an optional registration twist, alpha the base wrench, c the tip residual: what the section carries just beyond
+the tip (17), less R^T of the unknown wrench there.
 """
 
 from dataclasses import dataclass, replace
@@ -61,6 +62,7 @@ class Model:
     scaled: alpha in the rod's force and moment scales and zeta in tenths of L and of a radian; otherwise in SI (the paper's).
     tip: "none", or the unknown dead "force" or "wrench" at the tip, in the base frame. It is known to the markers through the base
     wrench alone, so it costs no tangent of the march.
+    tension_std: standard deviation (N) of the sensors of the tensions, which are then part of the state; None takes them as exact.
     """
 
     robot: Robot
@@ -69,6 +71,17 @@ class Model:
     scaled: bool = True
     steps: int = DEFAULT_STEPS
     tip: str = "none"
+    tension_std: float | None = None
+
+    @property
+    def tension_size(self) -> int:
+        """How many entries of x are errors of tensions, in units of tension_std."""
+        return 0 if self.tension_std is None else len(self.robot.tendons)
+
+    @property
+    def free_size(self) -> int:
+        """How many entries of x only the markers determine: neither alpha, which (17) holds, nor theta, which has a prior."""
+        return self.size - 6 - self.tension_size
 
     @property
     def load_size(self) -> int:
@@ -78,7 +91,7 @@ class Model:
     @property
     def size(self) -> int:
         """The length of x."""
-        return self.load_size + 6 * self.registration + 6
+        return self.load_size + self.tension_size + 6 * self.registration + 6
 
     def _scale_of(self, x: Tensor, first: float, second: float) -> Float[Tensor, " 6"]:
         return x.new_tensor([first] * 3 + [second] * 3) if self.scaled else x.new_ones(6)
@@ -91,7 +104,8 @@ class Model:
         self, x: Float[Tensor, "... n"]
     ) -> tuple[Float[Tensor, "... g"], Float[Tensor, "... 6"] | None, Float[Tensor, "... 6"]]:
         """gamma, zeta [m, rad] (None without registration) and alpha [N, N m]."""
-        gamma, _, zeta, alpha = x.tensor_split([self.coordinates.size, self.load_size, self.size - 6], -1)
+        cuts = [self.coordinates.size, self.load_size + self.tension_size, self.size - 6]
+        gamma, _, zeta, alpha = x.tensor_split(cuts, -1)
         rod = self.robot.rod
         zeta = zeta * self._scale_of(x, TURN_SCALE * rod.length, TURN_SCALE) if self.registration else None
         return gamma, zeta, alpha * self.alpha_scale(x)
@@ -101,16 +115,23 @@ class Model:
         tip = x[..., self.coordinates.size : self.load_size]
         return torch.nn.functional.pad(tip, (0, 6 - tip.shape[-1])) * self.alpha_scale(x)
 
+    def tension(self, x: Float[Tensor, "... n"], reading: Float[Tensor, "... T"] | None) -> Float[Tensor, "... T"] | None:
+        """The tensions (N) that x takes to be pulling: the readings, with their errors where those are unknown."""
+        if self.tension_std is None or reading is None:
+            return reading
+        return reading + self.tension_std * x[..., self.load_size : self.load_size + self.tension_size]
+
     def join(self, gamma: Float[Tensor, "B g"], alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:
-        """x from loads and a base wrench (N, N m), with nothing unknown at the tip and no registration error."""
-        between = alpha.new_zeros(alpha.shape[0], TIP_UNKNOWNS[self.tip] + 6 * self.registration)
+        """x from loads and a base wrench (N, N m), with nothing unknown at the tip and neither tension nor registration error."""
+        between = alpha.new_zeros(alpha.shape[0], TIP_UNKNOWNS[self.tip] + self.tension_size + 6 * self.registration)
         return torch.cat([gamma, between, alpha / self.alpha_scale(alpha)], -1)
 
     def shape(self, x: Float[Tensor, "... n"], markers: Markers, differentiable: bool = True) -> Shape:
         """The rod at the markers' arc lengths, in its own base frame."""
         gamma, _, alpha = self.split(x)
         loads = self.coordinates.loads(gamma)
-        return shape_from_base(self.robot, loads, alpha, markers.tension, markers.s, self.steps, differentiable)
+        tension = self.tension(x, markers.tension)
+        return shape_from_base(self.robot, loads, alpha, tension, markers.s, self.steps, differentiable)
 
     def h(self, x: Float[Tensor, "... n"], markers: Markers, differentiable: bool = True) -> Float[Tensor, "... z"]:
         """[p_1 .. p_P (m), c (N, N m)], (..., 3 P + 6): marker positions in the measured frame, then the tip residual."""
@@ -133,12 +154,12 @@ class Model:
 
         The rod's share of the tangents goes through `march_linearized`, which has a compiled path; what comes before it (load
         integrals of gamma) and after it (offsets, registration, tip residual) by torch.func. The same as forward_jacobian(h),
-        which is what is used where the nodes themselves move with x (point loads at unknown places).
+        which is what is used where the nodes move with x (point loads at unknown places) or tensions are unknown.
         """
         gamma, _, alpha = self.split(x)
         loads = self.coordinates.loads(gamma)
         grid = grid_for(self.robot, loads, markers.s, self.steps)
-        if grid.nodes.ndim > 1:
+        if grid.nodes.ndim > 1 or self.tension_size:
             return forward_jacobian(lambda x: self.h(x, markers), x)
         g, B, S = self.coordinates.size, len(x), grid.h.shape[-1]
         like = x.new_zeros(())
@@ -208,9 +229,9 @@ class Model:
         return torch.cat([w[:, :-6], TIP_EXACT**2 * w[:, -6:]], -1)
 
     def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Mean and precision of every entry of x: the loads' own; weak on tip and zeta, none on alpha, which (17) holds."""
+        """Mean and precision of every entry of x: the loads' own; weak on tip and zeta, 1 on theta, none on alpha."""
         mean, precision = self.coordinates.prior()
         tip = mean.new_full((TIP_UNKNOWNS[self.tip],), TIP_STD**-2)
         zeta, alpha = mean.new_full((6 * self.registration,), 1e-4), mean.new_zeros(6)
-        held = torch.cat([tip, zeta, alpha])
+        held = torch.cat([tip, mean.new_ones(self.tension_size), zeta, alpha])
         return torch.cat([mean, torch.zeros_like(held)]), torch.cat([precision, held])

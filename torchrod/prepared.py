@@ -109,7 +109,7 @@ def _numbers(model: Model) -> dict[str, float]:
         "moment_unit": rod.moment_scale if scaled else 1.0,
         "length_unit": TURN_SCALE * rod.length if scaled else 1.0,
         "angle_unit": TURN_SCALE if scaled else 1.0,
-        "tension_unit": 1.0,
+        "tension_unit": model.tension_std or 0.0,
     }
 
 
@@ -126,7 +126,13 @@ def _layout(
         tendons = robot.tendons.table(grid.stages, grid.inside, s.new_ones(len(robot.tendons)))
         table, active = replace(table, tendons=tendons), tendons.tau
     tensors, counts = fast.known(section, table, grid, grid.outputs_and_tip)
-    tensors |= {"s": grid.stages.contiguous(), "inside": grid.inside.contiguous(), "offsets": offsets, "weight": robot.weight}
+    tensors |= {
+        "s": grid.stages.contiguous(),
+        "inside": grid.inside.contiguous(),
+        "offsets": offsets,
+        "weight": robot.weight,
+        "active": active,
+    }
     locations = getattr(c, "locations", None)
     if family == "linear":
         tensors["basis"] = _basis(model, grid)
@@ -137,7 +143,12 @@ def _layout(
         tensors["node"] = _nodes_of(grid.nodes, torch.sigmoid(x[:, 2 : c.size : 3]) * robot.rod.length)
     loads = {"family": fast.FAMILIES[family], "count": getattr(c, "count", 0), "gamma": c.size}
     loads["per_load"] = c.size // max(loads["count"], 1)
-    state = {"size": model.size, "tip": model.load_size - c.size, "tensions": 0, "registration": int(model.registration)}
+    state = {
+        "size": model.size,
+        "tip": model.load_size - c.size,
+        "tensions": model.tension_size,
+        "registration": int(model.registration),
+    }
     return Layout(tensors, counts | loads | state, _numbers(model), active)
 
 
@@ -159,7 +170,8 @@ def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, 
         return layout.shared.with_rows(markers.positions, w, nu)
     tensors, counts = layout.tensors | {"positions": markers.positions, "w": w}, layout.counts
     if layout.active is not None and markers.tension is not None:
-        tension = robot.tendons.true_tension(markers.tension)
+        # Where a tension is unknown the kernel adds its error, and only then is it clamped at zero.
+        tension = robot.tendons.true_tension(markers.tension, clamped=model.tension_std is None)
         tensors["tau"] = tension[:, None, None, :] * layout.active
         counts = counts | {"newton": robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension)}
     return fast.FitTables.of(fast.with_rows(tensors, len(w)), counts, layout.numbers | {"robust": nu})

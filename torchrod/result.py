@@ -1,5 +1,6 @@
 """The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
@@ -35,6 +36,8 @@ class Estimate:
     (B, P, 3) m: the fitted rod at the markers, in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
     iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, cold or from other magnitudes.
     warm_started (B,): whether the fit that is reported started from a guess; learned (B,): torchrod.status.Learned codes.
+    tension, tension_std (B, T) N: as found; None where they are taken as exact. outlier (B, P): markers
+    that a robust fit has left aside. cost (B,): what was minimized; chi2: the same of the other markers, for the normal distribution.
     chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
     """
 
@@ -51,6 +54,10 @@ class Estimate:
     registration: Float[Tensor, "B 6"] | None
     centre_line: Float[Tensor, "B P 3"]
     residual: Float[Tensor, "B P 3"]
+    tension: Float[Tensor, "B T"] | None
+    tension_std: Float[Tensor, "B T"] | None
+    outlier: Bool[Tensor, "B P"]
+    cost: Float[Tensor, " B"]
     chi2: Float[Tensor, " B"]
     dof: Int[Tensor, " B"]
     accepted: Bool[Tensor, " B"]
@@ -141,7 +148,7 @@ class Estimate:
 
         Better: accepted where this one is not, else of lower cost.
         """
-        was, lower = self.accepted[index], other.chi2 < self.chi2[index].nan_to_num(torch.inf)
+        was, lower = self.accepted[index], other.cost < self.cost[index].nan_to_num(torch.inf)
         better = (other.accepted & ~was) | ((other.accepted == was) & lower)
         changed = {}
         for f in fields(Estimate):
@@ -196,6 +203,13 @@ def tip_covariance(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Te
     return torch.nn.functional.pad(block, (0, rest, 0, rest)) * scale * scale.unsqueeze(-1)
 
 
+def tension_std(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B T"]:
+    """Standard deviations of the tensions (N) after the fit."""
+    first = model.load_size
+    variance = covariance.diagonal(dim1=-2, dim2=-1)[:, first : first + model.tension_size]
+    return (model.tension_std or 0.0) * variance.clamp(min=0).sqrt()
+
+
 @lru_cache(maxsize=4096)
 def _limit(dof: int) -> float:
     """The 99.9 % point of chi^2."""
@@ -225,10 +239,16 @@ def make_estimate(
         return torch.where((status == int(Status.CONVERGED)).reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
 
     gamma, zeta, alpha = model.split(x)
+    tension = model.tension(x, markers.tension)
     report: LoadReport = model.coordinates.describe(gamma)
     covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *model.prior())[0])
     present = markers.present
-    dof = 3 * present.sum(-1) + 6 + model.coordinates.informative_priors - model.size
+    square = (prepared.w * sums.r**2)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
+    outlier = present & (square > _limit(3)) if math.isfinite(prepared.nu) else torch.zeros_like(present)
+    chi2 = cost - sums.cost[:, 0] + (square * ~outlier).sum(-1)
+    inside = present & ~outlier
+    dof = 3 * inside.sum(-1) + 6 + model.coordinates.informative_priors + model.tension_size - model.size
+    enough = 2 * inside.sum(-1) > present.sum(-1)  # a fit that leaves most of the markers aside explains nothing
     limit = torch.tensor([_limit(k) for k in dof.tolist()], dtype=cost.dtype)
     residual = sums.r[:, :-6].unflatten(-1, (-1, 3))
     return Estimate(
@@ -245,9 +265,13 @@ def make_estimate(
         registration=None if zeta is None else kept(zeta),
         centre_line=kept(sums.line),
         residual=torch.where(present.unsqueeze(-1), kept(residual), torch.nan),
-        chi2=kept(cost),
+        tension=None if model.tension_std is None or tension is None else kept(tension),
+        tension_std=None if model.tension_std is None else settled(tension_std(model, covariance)),
+        outlier=outlier,
+        cost=kept(cost),
+        chi2=kept(chi2),
         dof=dof,
-        accepted=(cost < limit) & (status == int(Status.CONVERGED)),
+        accepted=(chi2 < limit) & enough & (status == int(Status.CONVERGED)),
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,

@@ -45,7 +45,7 @@ def bic(fit: Estimate, model: Model, markers: Markers) -> Float[Tensor, " B"]:
     Source: Schwarz 1978, for Gaussian noise of known size. A width with a prior is paid for in chi^2, which contains the prior.
     """
     n = 3.0 * markers.present.sum(-1)
-    value = fit.chi2 + free_parameters(model) * torch.log(n.clamp(min=math.e))
+    value = fit.cost + free_parameters(model) * torch.log(n.clamp(min=math.e))
     return torch.where((fit.status == int(Status.CONVERGED)) & torch.isfinite(value), value, torch.inf)
 
 
@@ -145,7 +145,7 @@ def _explains_better(
 ) -> Bool[Tensor, " b"]:
     """By BIC; where neither converged, by chi^2."""
     neither = torch.isinf(score) & torch.isinf(best)
-    return torch.where(neither, other.chi2 < fit.chi2[index].nan_to_num(torch.inf), score < best)
+    return torch.where(neither, other.cost < fit.cost[index].nan_to_num(torch.inf), score < best)
 
 
 def _needed(

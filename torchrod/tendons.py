@@ -79,9 +79,10 @@ class Tendons:
         """Arc lengths (m) at which tendons end: step boundaries of the integration."""
         return tuple(t.ends_at for t in self.tendons)
 
-    def true_tension(self, reading: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
-        """tau = max(reading + tension_offset, 0) (N): a load cell has a zero offset, and a tendon can only pull."""
-        return (reading + torch.tensor([t.tension_offset for t in self.tendons], dtype=DTYPE)).clamp(min=0.0)
+    def true_tension(self, reading: Float[Tensor, "... T"], clamped: bool = True) -> Float[Tensor, "... T"]:
+        """tau = max(reading + tension_offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
+        tau = reading + torch.tensor([t.tension_offset for t in self.tendons], dtype=DTYPE)
+        return tau.clamp(min=0.0) if clamped else tau
 
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
         """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""

@@ -110,6 +110,8 @@ def _coordinates_misfit(card: dict[str, Any], model: Model) -> str | None:
         return "it predicts locations, and here they are known; leave out --location or --warm-start"
     if model.registration:
         return "it was not trained with a registration error; leave out --registration or --warm-start"
+    if model.tension_std is not None:
+        return "it was trained with tensions that are known; leave out --tension-std or --warm-start"
     if model.tip != "none":
         return "it was not trained with an unknown force at the tip; leave out --unknown-tip or --warm-start"
     if coordinates.count != card["contacts"]:

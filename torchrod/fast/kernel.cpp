@@ -47,7 +47,7 @@ void torchrod_march(const March* m, int64_t threads) {
     const Known& known = m->known;
     const int64_t n = m->tangents, g = m->load_tangents, points = 3 * known.steps;
     in_groups(m->batch, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
-        Group group{&known, lanes, g, 0, 0, nullptr, nullptr, {}, nullptr, nullptr};
+        Group group{&known, lanes, g, 0, 0, nullptr, nullptr, nullptr, {}, {}, nullptr};
         if (known.tendons) room.balance.resize(4 * known.steps), group.balance = room.balance.data();
         if (m->local) {
             room.local.resize(points * (1 + g) * PARTS);

@@ -11,10 +11,11 @@ struct Group {
     Lanes lanes;
     int64_t load_tangents, tension_tangents;
     double tension_unit;   // N, of one unit of a tension tangent
+    const V* tension;      // (tension_tangents), what the tensions' unknowns add (N)
     const V* local;        // (3 S + 1, 1 + load_tangents, PARTS): the stages of every step, then beyond the tip; or null
     const V* node_moves;   // (S + 1, load_tangents): how the nodes move; null where they do not
     Table weight;          // (3) N/m, the slope -dWn/ds where nodes move
-    const double* active;  // (S, 3, T), 1 where a tendon pulls; null unless tensions are free
+    Table active;          // (S, 3, T), 1 where a tendon pulls; unless tensions are free there is none
     Balance* balance;      // (4 S) or null
 };
 
@@ -62,10 +63,14 @@ template <int K> __attribute__((noinline)) void stage_of(const Group& g, int64_t
     for (int64_t x = 0; x < 3 * m.tendons; x++) s.dr[x] = fetch(m.dr, g.lanes, row * 3 * m.tendons + x);
     for (int64_t t = 0; t < m.tendons; t++) {
         s.tau[t] = fetch(m.tau, g.lanes, row * m.tendons + t);
-        for (int j = 0; j < K; j++) {
-            const bool mine = first + j - g.load_tangents == t && t < g.tension_tangents;
-            s.dtau[t][j] = splat(mine ? g.tension_unit * g.active[row * m.tendons + t] : 0.0);
+        V unit = V{};
+        if (t < g.tension_tangents) {  // tau = max(reading + unknown, 0) where the tendon pulls at all
+            const Mask on = fetch(g.active, g.lanes, row * m.tendons + t) > 0;
+            const V pull = s.tau[t] + g.tension[t];
+            s.tau[t] = select(on, larger(pull, V{}), V{});
+            unit = select(on & (pull > 0), splat(g.tension_unit), V{});
         }
+        for (int j = 0; j < K; j++) s.dtau[t][j] = first + j - g.load_tangents == t ? unit : V{};
     }
 }
 

@@ -12,8 +12,8 @@ struct Fit {
     int64_t size, tip, tensions, registration;  // entries of x in all, of the unknown wrench at the tip, of free tensions; flag
     double force_unit, moment_unit, length_unit, angle_unit, tension_unit;
     double robust;                  // degrees of freedom of Student's t, infinite for a normal distribution
-    const double *offsets, *active;  // (P, 3) or null; (S, 3, T) or null
-    Table weight;                   // (3) N/m: what hangs per metre, for nodes that move
+    const double* offsets;          // (P, 3) or null
+    Table active, weight;           // (S, 3, T) or none; (3) N/m: what hangs per metre, for nodes that move
     const double *positions, *w;    // (B, P, 3) with NaN where missing; (B, 3 P + 6)
 };
 
@@ -61,7 +61,7 @@ struct Motion {
 
 // Room for one group, kept from group to group.
 struct Room {
-    std::vector<V> local, moves, rows, line;
+    std::vector<V> local, moves, rows, line, tension;
     std::vector<Balance> balance;
 };
 
@@ -74,7 +74,9 @@ struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the cen
 
 template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, Room& room) {
     const Known& m = f.known;
-    Group g{&m, lanes, f.loads.size, f.tensions, f.tension_unit, nullptr, nullptr, f.weight, f.active, nullptr};
+    room.tension.resize(f.tensions);
+    for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(f.loads.size + f.tip + t);
+    Group g{&m, lanes, f.loads.size, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active, nullptr};
     if (m.tendons) room.balance.resize(4 * m.steps), g.balance = room.balance.data();
     if (f.loads.family == POINT) {
         room.moves.resize((m.steps + 1) * f.loads.size);

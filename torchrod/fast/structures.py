@@ -45,8 +45,8 @@ class Fit(ctypes.Structure):
         ("loads", Loads),
         *((n, _I) for n in ("size", "tip", "tensions", "registration")),
         *((n, _D) for n in ("force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "robust")),
-        *((n, _P) for n in ("offsets", "active")),
-        ("weight", Table),
+        ("offsets", _P),
+        *((n, Table) for n in ("active", "weight")),
         *((n, _P) for n in ("positions", "w")),
     ]
 
@@ -80,7 +80,7 @@ class Sums(ctypes.Structure):
 # Tensors that may have a row per sample, and their dimensions when they have none.
 SHARED_DIMENSIONS = {
     **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "tau": 3},
-    **{"at": 1, "s": 2, "inside": 2, "node": 1, "weight": 1},
+    **{"at": 1, "s": 2, "inside": 2, "node": 1, "weight": 1, "active": 3},
 }
 
 
