@@ -1,0 +1,315 @@
+"""The estimator in numba: RK4 with analytic tangents of the discrete steps, all cores, eight samples to a vector."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import get_num_threads, njit, prange
+
+from . import DECREMENT, DECREMENT_SHARE, MAX_ITERATIONS, SETTLED, STEP_LIMIT, TIP_EXACT, Fit, Problem, make_fit
+from .numba_march import HOT, LANES
+from .numba_model import Constants, make_work, march, marker_rows, normal_equations, tip_rows, turn
+from .numba_update import factor, forward, inverse, times
+
+PARALLEL = HOT | {"parallel": True}
+FULL_BLOCK = 3  # from so many samples on, eight lanes cost no more than as many single ones
+
+
+class Filter(NamedTuple):
+    """The filter's state and scratch of a block: lower triangles [n, n, lane], vectors [n, lane], numbers [lane]."""
+
+    Sigma: np.ndarray
+    cap: np.ndarray
+    before: np.ndarray
+    information: np.ndarray
+    g: np.ndarray
+    L: np.ndarray
+    d: np.ndarray
+    scratch: np.ndarray
+    y: np.ndarray
+    cost: np.ndarray
+    done: np.ndarray
+
+
+@njit(**HOT)
+def make_filter(n):
+    """Buffers for one thread."""
+    return Filter(
+        np.zeros((n, n, LANES)),
+        np.zeros(LANES),
+        np.zeros((n, LANES)),
+        np.zeros((n, n, LANES)),
+        np.zeros((n, LANES)),
+        np.zeros((n, n, LANES)),
+        np.zeros((n, LANES)),
+        np.zeros((n, n, LANES)),
+        np.zeros((n, LANES)),
+        np.zeros(LANES),
+        np.zeros(LANES, dtype=np.bool_),
+    )
+
+
+@njit(**HOT)
+def weigh(lanes, c, w, f, weight, tip_factor):
+    """Information of markers (weight per lane), tip and prior into f.information, and its gradient into f.g."""
+    for i in range(len(c.mean)):
+        for lane in range(lanes):
+            f.g[i, lane] = weight[lane] * w.g[i, lane] + tip_factor * w.tip_g[i, lane] + c.precision[i] * (c.mean[i] - w.x[i, lane])
+        for j in range(i + 1):
+            for lane in range(lanes):
+                f.information[i, j, lane] = weight[lane] * w.A[i, j, lane] + tip_factor * w.tip_A[i, j, lane]
+        for lane in range(lanes):
+            f.information[i, i, lane] += c.precision[i]
+
+
+@njit(**HOT)
+def advance(lanes, c, w, f, sums):
+    """One pass of the filter over a block: w.x, f.Sigma, f.cap onward, f.cost and f.done said of where it was.
+
+    sums: scratch (2, LANES).
+    """
+    n = len(c.mean)
+    if c.registration:
+        turn(lanes, c, w)
+    march(lanes, c, w)
+    normal_equations(lanes, c, w)
+    weight, inflated = sums[0], sums[1]
+    for lane in range(lanes):
+        f.cost[lane] = c.weight * w.sums[0, lane] + w.sums[1, lane]
+        for i in range(n):
+            f.cost[lane] += c.precision[i] * (c.mean[i] - w.x[i, lane]) ** 2
+        weight[lane] = c.weight
+    weigh(lanes, c, w, f, weight, 1.0)
+    factor(f.information, f.L, f.d)
+    forward(f.L, f.d, f.g, f.y)
+    for lane in range(lanes):
+        decrement = 0.0
+        for i in range(n):
+            decrement += f.y[i, lane] ** 2
+        f.done[lane] = decrement < max(DECREMENT, DECREMENT_SHARE * f.cost[lane])
+        each = decrement / max(3.0 * w.sums[2, lane], 1.0)
+        inflated[lane] = min(each if math.isfinite(each) else 0.0, f.cap[lane])
+        weight[lane] = c.weight / (1.0 + inflated[lane])
+    weigh(lanes, c, w, f, weight, 1.0)
+    update(lanes, f)
+    onward(lanes, w, f, inflated)
+
+
+@njit(**HOT)
+def update(lanes, f):
+    """Lambda = (Sigma + Q)^-1 + information with Q = 1: the step into f.y and Lambda^-1 into f.Sigma."""
+    n = len(f.g)
+    for i in range(n):
+        for lane in range(lanes):
+            f.Sigma[i, i, lane] += 1.0
+    factor(f.Sigma, f.L, f.d)
+    inverse(f.L, f.d, f.scratch, f.Sigma)
+    for i in range(n):
+        for j in range(i + 1):
+            for lane in range(lanes):
+                f.information[i, j, lane] += f.Sigma[i, j, lane]
+    factor(f.information, f.L, f.d)
+    inverse(f.L, f.d, f.scratch, f.Sigma)
+    times(f.Sigma, f.g, f.y)
+
+
+@njit(**HOT)
+def onward(lanes, w, f, inflated):
+    """Take the step where the sample has not converged; half way back where the model overflowed."""
+    n = len(f.g)
+    for lane in range(lanes):
+        gain, largest, fresh, finite = 0.0, 1e-300, True, math.isfinite(f.cost[lane])
+        for i in range(n):
+            gain += f.g[i, lane] * f.y[i, lane]
+            largest = max(largest, abs(f.y[i, lane]))
+            for j in range(i + 1):
+                fresh = fresh and math.isfinite(f.Sigma[i, j, lane])
+        f.done[lane] = f.done[lane] and finite
+        if gain < SETTLED:
+            f.cap[lane] = 0.1 * inflated[lane]
+        share = min(1.0, STEP_LIMIT / largest)
+        for i in range(n):
+            here = w.x[i, lane]
+            if not finite:
+                w.x[i, lane] = 0.5 * (here + f.before[i, lane])
+                continue
+            f.before[i, lane] = here
+            if fresh and not f.done[lane]:
+                w.x[i, lane] = here + share * f.y[i, lane]
+        if not (fresh and finite):
+            f.Sigma[:, :, lane] = 0.0
+            for i in range(n):
+                f.Sigma[i, i, lane] = 1.0
+
+
+@njit(**HOT)
+def posterior(lane, c, w, f, one, out):
+    """(H^T W H + P)^-1 of one lane with the tip's exact weight, into out (n, n). one: the filter's scratch."""
+    n = len(c.mean)
+    for i in range(n):
+        for j in range(i + 1):
+            one.information[i, j, 0] = c.weight * w.A[i, j, lane] + TIP_EXACT * w.tip_A[i, j, lane]
+        one.information[i, i, 0] += c.precision[i]
+    factor(one.information, one.L, one.d)
+    inverse(one.L, one.d, one.scratch, one.Sigma)
+    for i in range(n):
+        for j in range(i + 1):
+            out[i, j] = out[j, i] = one.Sigma[i, j, 0]
+
+
+@njit(**HOT)
+def linearize_block(c, first, lanes, x, h, H):
+    """h and H of one block of samples."""
+    P, w = len(c.keep), make_work(c)
+    for lane in range(lanes):
+        w.x[:, lane] = x[first + lane]
+    if c.registration:
+        turn(lanes, c, w)
+    march(lanes, c, w)
+    for j in range(P):
+        marker_rows(lanes, c, w, j, w.rows, w.r)
+        for lane in range(lanes):
+            h[first + lane, 3 * j : 3 * j + 3] = w.r[:3, lane]
+            H[first + lane, 3 * j : 3 * j + 3] = w.rows[:, :3, lane].T
+    tip_rows(lanes, c, w, w.rows)
+    for lane in range(lanes):
+        h[first + lane, 3 * P :] = w.tip[:, lane]
+        H[first + lane, 3 * P :] = w.rows[:, :6, lane].T
+
+
+@njit(**HOT)
+def iterate_task(c, first, stop, x, Sigma, cap, z, done):
+    """One pass of the filter over the samples of one task."""
+    n = x.shape[1]
+    w, f, sums = make_work(c), make_filter(n), np.zeros((2, LANES))
+    for start in range(first, stop, LANES):
+        lanes = min(LANES, stop - start)
+        for lane in range(lanes):
+            b = start + lane
+            w.x[:, lane], w.z[:, lane], f.before[:, lane] = x[b], z[b], x[b]
+            f.Sigma[:, :, lane], f.cap[lane] = Sigma[b], cap[b]
+        advance(lanes, c, w, f, sums)
+        for lane in range(lanes):
+            b = start + lane
+            x[b], cap[b], done[b] = w.x[:, lane], f.cap[lane], f.done[lane]
+            for i in range(n):
+                for j in range(i + 1):
+                    Sigma[b, i, j] = Sigma[b, j, i] = f.Sigma[i, j, lane]
+
+
+@njit(**HOT)
+def enter(lane, sample, x, z, w, f, held):
+    """Put a sample into a lane."""
+    held[lane] = sample
+    w.x[:, lane], w.z[:, lane], f.before[:, lane] = x[sample], z[sample], x[sample]
+    f.Sigma[:, :, lane], f.cap[lane] = 0.0, np.inf
+    for i in range(len(w.x)):
+        f.Sigma[i, i, lane] = 1.0
+
+
+@njit(**HOT)
+def move(source, lane, w, f, held):
+    """Put the sample of another lane into a lane."""
+    held[lane] = held[source]
+    w.x[:, lane], w.z[:, lane], f.before[:, lane] = w.x[:, source], w.z[:, source], f.before[:, source]
+    f.Sigma[:, :, lane], f.cap[lane] = f.Sigma[:, :, source], f.cap[source]
+
+
+@njit(**HOT)
+def estimate_task(c, first, stop, x, z, covariance, iterations, converged, cost):
+    """The samples of one task to convergence. A lane whose sample has converged takes the next one."""
+    n = x.shape[1]
+    w, f, one, sums = make_work(c), make_filter(n), make_filter(n), np.zeros((2, LANES))
+    held, live, following = np.zeros(LANES, dtype=np.int64), 0, first
+    while live < LANES and following < stop:
+        enter(live, following, x, z, w, f, held)
+        live, following = live + 1, following + 1
+    while live > 0:
+        advance(live if live < FULL_BLOCK else LANES, c, w, f, sums)
+        for lane in range(live - 1, -1, -1):
+            sample = held[lane]
+            iterations[sample] += 1
+            if not f.done[lane] and iterations[sample] < MAX_ITERATIONS:
+                continue
+            x[sample], converged[sample], cost[sample] = w.x[:, lane], f.done[lane], f.cost[lane]
+            posterior(lane, c, w, f, one, covariance[sample])
+            if following < stop:
+                enter(lane, following, x, z, w, f, held)
+                following += 1
+            else:
+                live -= 1
+                move(live, lane, w, f, held)
+
+
+@njit(**PARALLEL)
+def linearized(c, x, h, H):
+    """h (B, z) and H (B, z, n) of all samples."""
+    for block in prange((len(x) + LANES - 1) // LANES):
+        linearize_block(c, block * LANES, min(LANES, len(x) - block * LANES), x, h, H)
+
+
+@njit(**PARALLEL)
+def iterated(c, chunk, x, Sigma, cap, z, done):
+    """One pass of the filter over all samples, in place; `chunk` samples to a task."""
+    for task in prange((len(x) + chunk - 1) // chunk):
+        iterate_task(c, task * chunk, min((task + 1) * chunk, len(x)), x, Sigma, cap, z, done)
+
+
+@njit(**PARALLEL)
+def estimated(c, chunk, x, z, covariance, iterations, converged, cost):
+    """All samples to convergence, x in place."""
+    for task in prange((len(x) + chunk - 1) // chunk):
+        stop = min((task + 1) * chunk, len(x))
+        estimate_task(c, task * chunk, stop, x, z, covariance, iterations, converged, cost)
+
+
+class NumbaPeer:
+    """The estimator of one problem, compiled by numba on first use and cached on disk."""
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.constants = Constants(
+            problem.loads,
+            int(problem.registration),
+            problem.length,
+            problem.compliance,
+            np.diff(problem.nodes),
+            problem.arc,
+            problem.keep.astype(np.int64),
+            problem.force_scale,
+            problem.alpha_scale,
+            problem.shift,
+            problem.turn,
+            problem.prior_mean,
+            problem.prior_precision,
+            problem.noise**-2,
+            problem.tip_precision,
+        )
+
+    def linearize(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `peers.Peer`."""
+        z = 3 * len(self.problem.keep) + 6
+        h, H = np.empty((len(x), z)), np.empty((len(x), z, x.shape[1]))
+        linearized(self.constants, x, h, H)
+        return h, H
+
+    def iterate(
+        self, x: np.ndarray, Sigma: np.ndarray, cap: np.ndarray, positions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """See `peers.Peer`."""
+        x, Sigma, cap, done = x.copy(), Sigma.copy(), cap.copy(), np.zeros(len(x), dtype=np.bool_)
+        iterated(self.constants, _chunk(len(x)), x, Sigma, cap, positions.reshape(len(x), -1), done)
+        return x, Sigma, cap, done
+
+    def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:
+        """See `peers.Peer`."""
+        B, n = x.shape
+        x, covariance, iterations = x.copy(), np.empty((B, n, n)), np.zeros(B, dtype=np.int64)
+        converged, cost = np.zeros(B, dtype=np.bool_), np.empty(B)
+        estimated(self.constants, _chunk(B), x, positions.reshape(B, -1), covariance, iterations, converged, cost)
+        return make_fit(self.problem, x, covariance, iterations, converged, cost)
+
+
+def _chunk(samples: int) -> int:
+    """Samples to a task: whole blocks, few enough that every core has one."""
+    return min(512, max(LANES, LANES * math.ceil(samples / get_num_threads() / LANES)))
