@@ -201,7 +201,9 @@ def marker_rows(lanes, c, w, j, rows, h):
     gamma = 4 * c.loads
     p, dp, R = w.p[3 * j : 3 * j + 3], w.dp[3 * j : 3 * j + 3], w.turned
     if c.registration == 0:
-        h[:3] = p
+        for a in range(3):
+            for lane in range(lanes):
+                h[a, lane] = p[a, lane]
         for t in range(gamma + 6):
             for a in range(3):
                 for lane in range(lanes):
@@ -266,7 +268,8 @@ def normal_equations(lanes, c, w):
                     r[a, lane] = w.z[3 * j + a, lane] - r[a, lane] if seen else 0.0
                     w.sums[0, lane] += r[a, lane] ** 2
                     if not seen:
-                        rows[:, a, lane] = 0.0
+                        for i in range(len(rows)):
+                            rows[i, a, lane] = 0.0
         add_rows(w.rows, w.r, w.A, w.g)
     w.rows[:] = 0.0
     w.r[:] = 0.0

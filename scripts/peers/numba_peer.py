@@ -1,17 +1,22 @@
 """The estimator in numba: RK4 with analytic tangents of the discrete steps, all cores, eight samples to a vector."""
 
 import math
-from typing import NamedTuple
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import njit
 
 from . import DECREMENT, DECREMENT_SHARE, MAX_ITERATIONS, SETTLED, STEP_LIMIT, TIP_EXACT, Fit, Problem, make_fit
 from .numba_march import HOT, LANES
 from .numba_model import Constants, make_work, march, marker_rows, normal_equations, tip_rows, turn
 from .numba_update import factor, forward, inverse, times
 
-PARALLEL = HOT | {"parallel": True}
+FREE = HOT | {"nogil": True}  # for threads of our own: numba's parallel loops compile for twice as long and are no faster
+CORES = len(os.sched_getaffinity(0))
+LARGEST_TASK = 512
 FULL_BLOCK = 3  # from so many samples on, eight lanes cost no more than as many single ones
 
 
@@ -137,9 +142,9 @@ def onward(lanes, w, f, inflated):
             if fresh and not f.done[lane]:
                 w.x[i, lane] = here + share * f.y[i, lane]
         if not (fresh and finite):
-            f.Sigma[:, :, lane] = 0.0
             for i in range(n):
-                f.Sigma[i, i, lane] = 1.0
+                for j in range(i + 1):
+                    f.Sigma[i, j, lane] = 1.0 if i == j else 0.0
 
 
 @njit(**HOT)
@@ -158,64 +163,81 @@ def posterior(lane, c, w, f, one, out):
 
 
 @njit(**HOT)
-def linearize_block(c, first, lanes, x, h, H):
-    """h and H of one block of samples."""
-    P, w = len(c.keep), make_work(c)
-    for lane in range(lanes):
-        w.x[:, lane] = x[first + lane]
-    if c.registration:
-        turn(lanes, c, w)
-    march(lanes, c, w)
-    for j in range(P):
-        marker_rows(lanes, c, w, j, w.rows, w.r)
-        for lane in range(lanes):
-            h[first + lane, 3 * j : 3 * j + 3] = w.r[:3, lane]
-            H[first + lane, 3 * j : 3 * j + 3] = w.rows[:, :3, lane].T
-    tip_rows(lanes, c, w, w.rows)
-    for lane in range(lanes):
-        h[first + lane, 3 * P :] = w.tip[:, lane]
-        H[first + lane, 3 * P :] = w.rows[:, :6, lane].T
-
-
-@njit(**HOT)
-def iterate_task(c, first, stop, x, Sigma, cap, z, done):
-    """One pass of the filter over the samples of one task."""
-    n = x.shape[1]
-    w, f, sums = make_work(c), make_filter(n), np.zeros((2, LANES))
-    for start in range(first, stop, LANES):
-        lanes = min(LANES, stop - start)
-        for lane in range(lanes):
-            b = start + lane
-            w.x[:, lane], w.z[:, lane], f.before[:, lane] = x[b], z[b], x[b]
-            f.Sigma[:, :, lane], f.cap[lane] = Sigma[b], cap[b]
-        advance(lanes, c, w, f, sums)
-        for lane in range(lanes):
-            b = start + lane
-            x[b], cap[b], done[b] = w.x[:, lane], f.cap[lane], f.done[lane]
-            for i in range(n):
-                for j in range(i + 1):
-                    Sigma[b, i, j] = Sigma[b, j, i] = f.Sigma[i, j, lane]
-
-
-@njit(**HOT)
 def enter(lane, sample, x, z, w, f, held):
     """Put a sample into a lane."""
-    held[lane] = sample
-    w.x[:, lane], w.z[:, lane], f.before[:, lane] = x[sample], z[sample], x[sample]
-    f.Sigma[:, :, lane], f.cap[lane] = 0.0, np.inf
+    held[lane], f.cap[lane] = sample, np.inf
+    for i in range(len(w.z)):
+        w.z[i, lane] = z[sample, i]
     for i in range(len(w.x)):
+        w.x[i, lane] = f.before[i, lane] = x[sample, i]
+        for j in range(i):
+            f.Sigma[i, j, lane] = 0.0
         f.Sigma[i, i, lane] = 1.0
 
 
 @njit(**HOT)
 def move(source, lane, w, f, held):
     """Put the sample of another lane into a lane."""
-    held[lane] = held[source]
-    w.x[:, lane], w.z[:, lane], f.before[:, lane] = w.x[:, source], w.z[:, source], f.before[:, source]
-    f.Sigma[:, :, lane], f.cap[lane] = f.Sigma[:, :, source], f.cap[source]
+    held[lane], f.cap[lane] = held[source], f.cap[source]
+    for i in range(len(w.z)):
+        w.z[i, lane] = w.z[i, source]
+    for i in range(len(w.x)):
+        w.x[i, lane], f.before[i, lane] = w.x[i, source], f.before[i, source]
+        for j in range(i + 1):
+            f.Sigma[i, j, lane] = f.Sigma[i, j, source]
 
 
-@njit(**HOT)
+@njit(**FREE)
+def linearize_task(c, first, stop, x, h, H):
+    """h and H of the samples of one task."""
+    P, n, w = len(c.keep), x.shape[1], make_work(c)
+    for start in range(first, stop, LANES):
+        lanes = min(LANES, stop - start)
+        for lane in range(lanes):
+            for i in range(n):
+                w.x[i, lane] = x[start + lane, i]
+        if c.registration:
+            turn(lanes, c, w)
+        march(lanes, c, w)
+        for j in range(P + 2):
+            row = 3 * j
+            if j < P:
+                marker_rows(lanes, c, w, j, w.rows, w.r)
+            elif j == P:
+                tip_rows(lanes, c, w, w.rows)
+            for a in range(3):
+                k = a + 3 if j == P + 1 else a
+                for lane in range(lanes):
+                    h[start + lane, row + a] = w.r[a, lane] if j < P else w.tip[k, lane]
+                    for i in range(n):
+                        H[start + lane, row + a, i] = w.rows[i, k, lane]
+
+
+@njit(**FREE)
+def iterate_task(c, first, stop, x, Sigma, cap, z, done):
+    """One pass of the filter over the samples of one task."""
+    n = x.shape[1]
+    w, f, sums, held = make_work(c), make_filter(n), np.zeros((2, LANES)), np.zeros(LANES, dtype=np.int64)
+    for start in range(first, stop, LANES):
+        lanes = min(LANES, stop - start)
+        for lane in range(lanes):
+            b = start + lane
+            enter(lane, b, x, z, w, f, held)
+            f.cap[lane] = cap[b]
+            for i in range(n):
+                for j in range(i + 1):
+                    f.Sigma[i, j, lane] = Sigma[b, i, j]
+        advance(lanes, c, w, f, sums)
+        for lane in range(lanes):
+            b = start + lane
+            cap[b], done[b] = f.cap[lane], f.done[lane]
+            for i in range(n):
+                x[b, i] = w.x[i, lane]
+                for j in range(i + 1):
+                    Sigma[b, i, j] = Sigma[b, j, i] = f.Sigma[i, j, lane]
+
+
+@njit(**FREE)
 def estimate_task(c, first, stop, x, z, covariance, iterations, converged, cost):
     """The samples of one task to convergence. A lane whose sample has converged takes the next one."""
     n = x.shape[1]
@@ -231,7 +253,9 @@ def estimate_task(c, first, stop, x, z, covariance, iterations, converged, cost)
             iterations[sample] += 1
             if not f.done[lane] and iterations[sample] < MAX_ITERATIONS:
                 continue
-            x[sample], converged[sample], cost[sample] = w.x[:, lane], f.done[lane], f.cost[lane]
+            converged[sample], cost[sample] = f.done[lane], f.cost[lane]
+            for i in range(n):
+                x[sample, i] = w.x[i, lane]
             posterior(lane, c, w, f, one, covariance[sample])
             if following < stop:
                 enter(lane, following, x, z, w, f, held)
@@ -241,26 +265,21 @@ def estimate_task(c, first, stop, x, z, covariance, iterations, converged, cost)
                 move(live, lane, w, f, held)
 
 
-@njit(**PARALLEL)
-def linearized(c, x, h, H):
-    """h (B, z) and H (B, z, n) of all samples."""
-    for block in prange((len(x) + LANES - 1) // LANES):
-        linearize_block(c, block * LANES, min(LANES, len(x) - block * LANES), x, h, H)
+def in_tasks(task: Any, constants: Constants, samples: int, *arrays: np.ndarray) -> None:
+    """A task over all samples, shared out to the cores: whole blocks, and no task so large that a core could be left waiting."""
+    size = min(LARGEST_TASK, LANES * math.ceil(samples / CORES / LANES))
+    parts = [(first, min(first + size, samples)) for first in range(0, samples, size)]
+    if len(parts) == 1:
+        task(constants, *parts[0], *arrays)
+        return
+    for done in [pool().submit(task, constants, *part, *arrays) for part in parts]:
+        done.result()
 
 
-@njit(**PARALLEL)
-def iterated(c, chunk, x, Sigma, cap, z, done):
-    """One pass of the filter over all samples, in place; `chunk` samples to a task."""
-    for task in prange((len(x) + chunk - 1) // chunk):
-        iterate_task(c, task * chunk, min((task + 1) * chunk, len(x)), x, Sigma, cap, z, done)
-
-
-@njit(**PARALLEL)
-def estimated(c, chunk, x, z, covariance, iterations, converged, cost):
-    """All samples to convergence, x in place."""
-    for task in prange((len(x) + chunk - 1) // chunk):
-        stop = min((task + 1) * chunk, len(x))
-        estimate_task(c, task * chunk, stop, x, z, covariance, iterations, converged, cost)
+@cache
+def pool() -> ThreadPoolExecutor:
+    """A thread for every core: the tasks do not hold the interpreter's lock."""
+    return ThreadPoolExecutor(CORES)
 
 
 class NumbaPeer:
@@ -290,7 +309,7 @@ class NumbaPeer:
         """See `peers.Peer`."""
         z = 3 * len(self.problem.keep) + 6
         h, H = np.empty((len(x), z)), np.empty((len(x), z, x.shape[1]))
-        linearized(self.constants, x, h, H)
+        in_tasks(linearize_task, self.constants, len(x), x, h, H)
         return h, H
 
     def iterate(
@@ -298,7 +317,7 @@ class NumbaPeer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See `peers.Peer`."""
         x, Sigma, cap, done = x.copy(), Sigma.copy(), cap.copy(), np.zeros(len(x), dtype=np.bool_)
-        iterated(self.constants, _chunk(len(x)), x, Sigma, cap, positions.reshape(len(x), -1), done)
+        in_tasks(iterate_task, self.constants, len(x), x, Sigma, cap, positions.reshape(len(x), -1), done)
         return x, Sigma, cap, done
 
     def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:
@@ -306,10 +325,5 @@ class NumbaPeer:
         B, n = x.shape
         x, covariance, iterations = x.copy(), np.empty((B, n, n)), np.zeros(B, dtype=np.int64)
         converged, cost = np.zeros(B, dtype=np.bool_), np.empty(B)
-        estimated(self.constants, _chunk(B), x, positions.reshape(B, -1), covariance, iterations, converged, cost)
+        in_tasks(estimate_task, self.constants, B, x, positions.reshape(B, -1), covariance, iterations, converged, cost)
         return make_fit(self.problem, x, covariance, iterations, converged, cost)
-
-
-def _chunk(samples: int) -> int:
-    """Samples to a task: whole blocks, few enough that every core has one."""
-    return min(512, max(LANES, LANES * math.ceil(samples / get_num_threads() / LANES)))
