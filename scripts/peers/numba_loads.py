@@ -9,7 +9,7 @@ import math
 
 from numba import njit
 
-from .numba_march import HOT, LANES, PARTS
+from .numba_march import HOT
 
 ROOT_PI = math.sqrt(math.pi)
 FAR = 6.0  # beyond, erf is 1 and exp(-X^2) is 0 to double precision

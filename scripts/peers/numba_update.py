@@ -1,9 +1,9 @@
 """Normal equations and the filter's update in numba, eight lanes at a time.
 
-Loops over eight lanes with so little in them gain nothing from LLVM's loop vectorizer, which must first test whether arrays overlap.
-Here the lanes are written out, and the vectorizer of straight code, off in numba by default, packs them: a sum stays in one vector
-register over a whole loop. (It would spoil the march, so it is on for these functions only.) Indices are unsigned, so that none needs
-a test for being negative. What cannot be factored turns to NaN, in its own lane only, and is seen by the caller.
+Loops over eight lanes with so little in them gain nothing from LLVM's loop vectorizer, which must first test whether arrays
+overlap. Here the lanes are written out, and the vectorizer of straight code, off in numba by default, packs them: a sum stays in
+one vector register over a whole loop. (It would spoil the march, so it is on for these functions only.) Indices are unsigned, so
+that none needs a test for being negative. What cannot be factored turns to NaN, in its own lane only, and is seen by the caller.
 """
 
 import math
