@@ -1,0 +1,99 @@
+"""Whether every path and peer gives torchrod's answers: nothing is compared in speed that is not the same."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .cases import ITERATION, STUDY, write
+from .processes import Process
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Largest relative error of h and of each column of H, and of a finished fit: force (N), location (m), cost (chi^2).
+
+    elsewhere: the share of fits that may end at another, dearer minimum; they are counted and not compared.
+    """
+
+    h: float = 1e-8
+    H: float = 1e-8
+    force: float = 1e-4
+    location: float = 1e-5
+    cost: float = 1e-4
+    elsewhere: float = 0.0
+    samples: int = 64
+
+
+DEARER = 1.0  # of chi^2: another minimum
+# scipy takes differences, and has its own test of convergence, which leaves it elsewhere in the flat valley of the width; its plain
+# damping sometimes leads to a push of another size.
+TOLERANCES = {
+    "scipy": Tolerance(H=1e-4, force=5e-3, location=2e-4, cost=5e-3, elsewhere=0.5, samples=4),
+    "torchrod, eager": Tolerance(samples=16),
+}
+CHECKED = ("h", "H", "force", "location", "cost", "elsewhere")
+
+
+class Disagreement(Exception):
+    """A peer does not compute what torchrod computes; says what and by how much."""
+
+
+def linear_differences(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, float]:
+    """Largest relative differences of h and of the columns of H; infinite where one is not finite."""
+    h, H = (np.abs(theirs[name] - ours[name][: len(theirs[name])]) for name in ("h", "H"))
+    values = {"h": h.max() / np.abs(ours["h"]).max(), "H": (H.max((0, 1)) / np.abs(ours["H"]).max((0, 1))).max()}
+    return {name: float(np.nan_to_num(value, nan=np.inf)) for name, value in values.items()}
+
+
+def fit_differences(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, float]:
+    """Largest differences of finished fits, the share that ended elsewhere, and the share on which both say whether it converged."""
+    ours = {name: value[: len(theirs["x"])] for name, value in ours.items()}
+    elsewhere = theirs["cost"] > ours["cost"] + DEARER
+    both = ours["converged"] & theirs["converged"] & ~elsewhere
+    found = {name: np.abs(theirs[name] - ours[name])[both].max(initial=0.0) for name in ("force", "location", "cost")}
+    found |= {"elsewhere": elsewhere.mean(), "converged": np.mean(ours["converged"] == theirs["converged"])}
+    return {name: float(np.nan_to_num(value, nan=np.inf)) for name, value in found.items()}
+
+
+def verify(name: str, found: dict[str, float], tolerance: Tolerance) -> None:
+    """Raise Disagreement where a difference is larger than allowed."""
+    for what in CHECKED:
+        most = getattr(tolerance, what)
+        if not found[what] <= most:
+            raise Disagreement(f"{name} differs from torchrod in {what} by {found[what]:.2g}, more than {most:g}")
+    if found["converged"] < 1.0:
+        raise Disagreement(f"{name} and torchrod converge on different samples: they agree on {100 * found['converged']:.0f} %")
+
+
+def answers(process: Process, folder: Path, samples: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """h and H of the case with the registration, and fits of the one without, as a worker finds them."""
+    found = []
+    for case, fits in ((ITERATION, False), (STUDY, True)):
+        out = folder / f"{process.name.replace(', ', '-')}-{case.name}-answers.npz"
+        process.ask("answers", data=str(write(case, folder)), out=str(out), samples=samples, fits=fits)
+        with np.load(out) as file:
+            found.append(dict(file))
+    return found[0], found[1]
+
+
+def checked(processes: dict[str, Process], folder: Path) -> dict[str, dict[str, Any]]:
+    """Differences of every worker from torchrod's compiled path; all work at once, for here no time is taken.
+
+    Errors: Disagreement.
+    """
+    limits = {name: TOLERANCES.get(name, Tolerance()) for name in processes}
+    for case in (ITERATION, STUDY):
+        write(case, folder)
+    with ThreadPoolExecutor() as pool:
+        asked = {name: pool.submit(answers, process, folder, limits[name].samples) for name, process in processes.items()}
+        said = {name: future.result() for name, future in asked.items()}
+    found: dict[str, dict[str, Any]] = {}
+    reference = said.pop("torchrod")
+    for name, theirs in said.items():
+        found[name] = linear_differences(reference[0], theirs[0]) | fit_differences(reference[1], theirs[1])
+        verify(name, found[name], limits[name])
+        found[name]["samples"] = limits[name].samples
+    return found

@@ -1,0 +1,66 @@
+"""Worker processes: which paths there are, how each is started, and how it is asked."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import peers
+
+from torchrod import fast
+
+SCRIPTS = Path(__file__).resolve().parents[1]
+PATIENCE = 900  # seconds that a worker may take for a job
+TORCHROD = {"torchrod": {}, "torchrod, eager": {"TORCHROD_FAST": "0"}, "torchrod, compiled": {"TORCHROD_FAST": "compile"}}
+
+
+def available(name: str) -> bool:
+    """Whether a path can be measured here."""
+    if name == "torchrod, compiled":
+        return "compile" in getattr(fast, "PATHS", ())
+    return name in TORCHROD or peers.installed(name)
+
+
+def environment(name: str, caches: Path) -> dict[str, str]:
+    """What a worker is started with. numba forgets to look whether functions that a cached one calls have changed."""
+    sources = b"".join(path.read_bytes() for path in sorted((SCRIPTS / "peers").glob("*.py")))
+    numba = caches / f"numba-{hashlib.sha256(sources).hexdigest()[:12]}"
+    return os.environ | {"NUMBA_CACHE_DIR": str(numba)} | TORCHROD.get(name, {})
+
+
+class Process:
+    """One worker; a context manager."""
+
+    def __init__(self, name: str, caches: Path, cores: int | None = None, **more: str):
+        self.name = name
+        command = [sys.executable, str(SCRIPTS / "benchmarks" / "worker.py"), name, *([] if cores is None else [str(cores)])]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen(command, env=environment(name, caches) | more, **pipes)
+
+    def ask(self, job: str, **arguments: Any) -> dict[str, Any]:
+        """A job's answer. Errors: RuntimeError where the worker failed or took too long; it has said why on standard error."""
+        assert self.process.stdin is not None and self.process.stdout is not None
+        watch = threading.Timer(PATIENCE, self.process.kill)
+        watch.start()
+        try:
+            self.process.stdin.write(json.dumps({"job": job} | arguments) + "\n")
+            self.process.stdin.flush()
+            line = self.process.stdout.readline()
+        finally:
+            watch.cancel()
+        if not line:
+            raise RuntimeError(f"the worker of {self.name} ended, or was stopped after {PATIENCE} s, on the job {job} {arguments}")
+        return json.loads(line)
+
+    def __enter__(self) -> "Process":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self.process.stdin is not None and self.process.stdout is not None
+        self.process.stdin.close()
+        self.process.wait()
+        self.process.stdout.close()

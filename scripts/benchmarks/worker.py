@@ -1,0 +1,153 @@
+"""A process that measures one path or peer: python scripts/benchmarks/worker.py NAME [CORES].
+
+Reads a job a line (JSON) from standard input and answers with a line (JSON). One process per path keeps compilers, thread pools
+and memory apart; the parent asks them in turn, so that all are measured on the same machine in the same minutes.
+"""
+
+import json
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TRIES = 3  # at least so many calls, of which the fastest counts
+
+
+def limit_cores(cores: int) -> None:
+    """Before anything that makes threads is imported."""
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    os.environ["OMP_NUM_THREADS"] = str(cores)
+
+
+class Worker:
+    """One path, its problems by file."""
+
+    def __init__(self, name: str):
+        self.name = name
+        self.loaded: dict[str, tuple[Any, dict[str, np.ndarray]]] = {}
+
+    def case(self, path: str) -> tuple[Any, dict[str, np.ndarray]]:
+        """The peer of a problem, and its samples."""
+        if path not in self.loaded:
+            from peers import Problem, peer
+
+            problem, arrays = Problem.load(Path(path))
+            if self.name.startswith("torchrod"):
+                from benchmarks.torchrod_path import TorchrodPeer
+
+                self.loaded[path] = TorchrodPeer(problem), arrays
+            else:
+                self.loaded[path] = peer(self.name, problem), arrays
+        return self.loaded[path]
+
+    def ready(self) -> dict[str, Any]:
+        """Import what the path needs."""
+        from peers import PEERS
+
+        begin = time.perf_counter()
+        __import__(PEERS[self.name][0] if self.name in PEERS else "benchmarks.torchrod_path")
+        return {"import_s": time.perf_counter() - begin}
+
+    def iteration(self, data: str, batch: int, budget: float) -> dict[str, Any]:
+        """Seconds of one iteration of the whole batch."""
+        peer, arrays = self.case(data)
+        x, positions = repeated(arrays["near"], batch), repeated(arrays["positions"], batch)
+        Sigma, cap = np.tile(np.eye(x.shape[1]), (batch, 1, 1)), np.full(batch, np.inf)
+        if self.name == "scipy":  # has no iteration of its own: h and H are nearly all of it
+            return timed(lambda: peer.linearize(x), budget)
+        return timed(lambda: peer.iterate(x, Sigma, cap, positions), budget)
+
+    def estimate(self, data: str, batch: int, budget: float, start: str = "cold") -> dict[str, Any]:
+        """Seconds of whole estimates of the batch, and the share of torchrod's that is not spent in its kernel."""
+        peer, arrays = self.case(data)
+        x, positions = repeated(arrays["start"], batch), repeated(arrays["positions"], batch)
+        if not self.name.startswith("torchrod"):
+            found = timed(lambda: peer.estimate(x, positions), budget)
+            fit = found.pop("value")
+            return found | {"converged": float(fit.converged.mean()), "iterations": float(fit.iterations.mean())}
+        from benchmarks.torchrod_path import kernel_seconds
+
+        found = timed(lambda: peer.fitted(start, positions), budget, kernel_seconds)
+        fit = found.pop("value")
+        return found | {"converged": float((fit.status == 0).double().mean()), "iterations": float(fit.iterations.double().mean())}
+
+    def frames(self, data: str) -> dict[str, Any]:
+        """Seconds of each frame of a film, through an estimator that lives on; None while torchrod has none."""
+        peer, arrays = self.case(data)
+        frame = peer.frame_estimator()
+        if frame is None:
+            return {"seconds": None}
+        return {"seconds": [clocked(lambda seen=seen: frame(seen)) for seen in arrays["positions"]]}
+
+    def answers(self, data: str, out: str, samples: int, fits: bool) -> dict[str, Any]:
+        """h and H, or finished fits, as a file."""
+        peer, arrays = self.case(data)
+        x, start, positions = (arrays[name][:samples] for name in ("near", "start", "positions"))
+        found = vars(peer.estimate(start, positions)) if fits else dict(zip(("h", "H"), peer.linearize(x), strict=True))
+        np.savez(out, **found)
+        return {}
+
+    def memory(self, data: str, batch: int) -> dict[str, Any]:
+        """The largest resident size (bytes) before and after whole estimates of a batch."""
+        peer, arrays = self.case(data)
+        before = peak_bytes()
+        x, positions = repeated(arrays["start"], batch), repeated(arrays["positions"], batch)
+        begin = time.perf_counter()
+        peer.estimate(x, positions)
+        return {"before": before, "peak": peak_bytes(), "seconds": time.perf_counter() - begin}
+
+
+def repeated(array: np.ndarray, batch: int) -> np.ndarray:
+    """`batch` samples, the distinct ones over and over."""
+    return array[np.arange(batch) % len(array)]
+
+
+def peak_bytes() -> int:
+    """Of this process, up to now (Linux counts kilobytes)."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def clocked(what: Callable[[], object]) -> float:
+    """Wall seconds of one call."""
+    begin = time.perf_counter()
+    what()
+    return time.perf_counter() - begin
+
+
+def timed(what: Callable[[], Any], budget: float, kernel: Callable[[], float | None] = lambda: None) -> dict[str, Any]:
+    """The first call, the fastest of at least TRIES further ones within a budget of seconds, and the kernel's share of that."""
+    taken, shares, value, first = [], [], None, clocked(what)
+    while len(taken) < TRIES or sum(taken) < budget:
+        before, begin = kernel(), time.perf_counter()
+        value = what()
+        taken.append(time.perf_counter() - begin)
+        after = kernel()
+        shares.append(None if before is None or after is None else (after - before) / taken[-1])
+        if sum(taken) > 3 * budget:
+            break
+    best = min(range(len(taken)), key=taken.__getitem__)
+    return {"first_s": first, "seconds": taken[best], "calls": len(taken), "kernel_share": shares[best], "value": value}
+
+
+def main() -> None:
+    """Serve jobs until standard input ends."""
+    if len(sys.argv) > 2:
+        limit_cores(int(sys.argv[2]))
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    worker = Worker(sys.argv[1])
+    answers, sys.stdout = sys.stdout, sys.stderr  # what a library prints must not be taken for an answer
+    for line in sys.stdin:
+        job = json.loads(line)
+        answer = getattr(worker, job.pop("job"))(**job)
+        answer.pop("value", None)
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()
