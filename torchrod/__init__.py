@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .calibration import Calibration, calibrate
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .dataset import DatasetSpec, simulate_shard
+    from .diagnosis import Diagnosis, diagnose
     from .errors import InputError
     from .estimator import Settings, estimate, paper_settings
     from .io import Dataset, Shapes, read_dataset, read_dataset_spec, read_robot, read_shapes, write_result, write_shapes
@@ -37,6 +38,7 @@ _HOMES = {
     "calibration": ("Calibration", "calibrate"),
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "dataset": ("DatasetSpec", "simulate_shard"),
+    "diagnosis": ("Diagnosis", "diagnose"),
     "errors": ("InputError",),
     "estimator": ("Settings", "estimate", "paper_settings"),
     "io": (
@@ -70,6 +72,7 @@ __all__ = [
     "Calibration",
     "Dataset",
     "DatasetSpec",
+    "Diagnosis",
     "Equilibrium",
     "Estimate",
     "Fit",
@@ -101,6 +104,7 @@ __all__ = [
     "bounds",
     "calibrate",
     "cold_start",
+    "diagnose",
     "draw",
     "draw_on",
     "estimate",
