@@ -22,7 +22,7 @@ LAYERS = [
     {"io", "plot", "selection"},
     {"calibration", "placement"},
     {"unloaded", "observability"},
-    {"probe", "stream"},
+    {"probe", "stream", "diagnosis"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
     {"fit"},

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .calibration import Calibration, calibrate
     from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
     from .dataset import DatasetSpec, simulate_shard
+    from .diagnosis import Diagnosis, diagnose
     from .errors import InputError
     from .estimator import Settings, estimate, paper_settings
     from .fit import Fit
@@ -39,6 +40,7 @@ _HOMES = {
     "calibration": ("Calibration", "calibrate"),
     "coordinates": ("FourierCoordinates", "GaussianCoordinates", "PaperCoordinates", "PointCoordinates"),
     "dataset": ("DatasetSpec", "simulate_shard"),
+    "diagnosis": ("Diagnosis", "diagnose"),
     "errors": ("InputError",),
     "estimator": ("Settings", "estimate", "paper_settings"),
     "fit": ("Fit",),
@@ -74,6 +76,7 @@ __all__ = [
     "Calibration",
     "Dataset",
     "DatasetSpec",
+    "Diagnosis",
     "Equilibrium",
     "Estimate",
     "Estimator",
@@ -106,6 +109,7 @@ __all__ = [
     "bounds",
     "calibrate",
     "cold_start",
+    "diagnose",
     "draw",
     "draw_on",
     "estimate",

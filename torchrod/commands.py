@@ -11,6 +11,7 @@ from tqdm import tqdm
 from .arguments import noise_std, positive, writable
 from .calibrate_command import calibrate
 from .coordinates import GaussianCoordinates
+from .diagnosis import Diagnosis, diagnose
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
@@ -86,13 +87,14 @@ def estimate(options: Namespace) -> None:
                 result = run_estimate(only, shapes.markers, options.noise, settings, start_of(only), bar.update)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
-    print(_report(result, shapes.samples))  # noqa: T201
+    choice = torch.zeros(len(shapes.samples), dtype=torch.int64) if evidence is None else evidence.choice
+    fitted_by = [(c.model, (choice == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
+    diagnosis = diagnose(fitted_by, shapes.markers, options.noise, result, settings)
+    print(_report(result, shapes.samples, diagnosis))  # noqa: T201
     if options.out or options.plot:
-        everyone = torch.zeros(len(shapes.samples), dtype=torch.int64) if evidence is None else evidence.choice
-        fitted_by = [(c.model, (everyone == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
         profile = joined_profile(fitted_by, result.x, result.covariance)
         if options.out:
-            write_result(options.out, result, shapes.samples, robot.name, evidence, profile)
+            write_result(options.out, result, shapes.samples, robot.name, evidence, profile, diagnosis)
         if options.plot:
             _draw(options.plot, robot, shapes.markers, result, shapes.samples, profile)
 
@@ -135,7 +137,7 @@ def _bar(total: int, what: str) -> tqdm:
     return tqdm(total=total, desc=what, unit="sample", delay=1.0, leave=False, dynamic_ncols=True)
 
 
-def _report(result: Estimate, samples: list[str]) -> str:
+def _report(result: Estimate, samples: list[str], diagnosis: Diagnosis) -> str:
     """The table on the screen: one line per load."""
     columns = f"{'force (N)':>20}{'F_x (N)':>10}{'F_y (N)':>10}{'location (mm)':>20}{'rms (mm)':>10}"
     lines = [f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{columns}"]
@@ -158,8 +160,8 @@ def _report(result: Estimate, samples: list[str]) -> str:
             std = result.tip_covariance[b].diagonal().sqrt().tolist()
             both = [f"{v:.4f} +- {s:.4f}" for v, s in zip(result.tip[b].tolist(), std, strict=True) if s > 0 or math.isnan(s)]
             lines.append(f"{'':>28} tip, base frame: force (N) {', '.join(both[:3])}" + _moment(both[3:]))
-        if not result.accepted[b]:
-            notes.append(f"sample {name}: {result.message(b)}")
+        if not result.accepted[b] or diagnosis.message(b):
+            notes.append(f"sample {name}: {result.message(b)} {diagnosis.message(b)}".rstrip())
     return "\n".join([*lines, *notes])
 
 

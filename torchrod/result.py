@@ -36,8 +36,8 @@ class Estimate:
     (B, P, 3) m: the fitted rod at the markers, in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
     iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, cold or from other magnitudes.
     warm_started (B,): whether the fit that is reported started from a guess; learned (B,): torchrod.status.Learned codes.
-    tension, tension_std (B, T) N: as found; None where they are taken as exact. outlier (B, P): markers
-    that a robust fit has left aside. cost (B,): what was minimized; chi2: the same of the other markers, for the normal distribution.
+    tension, tension_std (B, T) N: as found; None where they are taken as exact. outlier (B, P): markers that a robust fit has left
+    aside. cost (B,): what was minimized; chi2: the same of the other markers, as the normal distribution has it.
     chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
     """
 
@@ -216,6 +216,20 @@ def _limit(dof: int) -> float:
     return float(chi2_distribution.ppf(ACCEPT, max(dof, 1)))
 
 
+def _verdict(
+    prepared: Prepared, sums: Sums, cost: Float[Tensor, " B"]
+) -> tuple[Bool[Tensor, "B P"], Float[Tensor, " B"], Int[Tensor, " B"], Bool[Tensor, " B"]]:
+    """outlier, chi2 and dof of Estimate, and whether the fit explains the markers: one that leaves most aside does not."""
+    model, present = prepared.model, prepared.markers.present
+    square = (prepared.w * sums.r**2)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
+    outlier = present & (square > _limit(3)) if math.isfinite(prepared.nu) else torch.zeros_like(present)
+    inside = present & ~outlier
+    chi2 = cost - sums.cost[:, 0] + (square * inside).sum(-1)
+    dof = 3 * inside.sum(-1) + 6 + model.coordinates.informative_priors + model.tension_size - model.size
+    limit = torch.tensor([_limit(k) for k in dof.tolist()], dtype=cost.dtype)
+    return outlier, chi2, dof, (chi2 < limit) & (2 * inside.sum(-1) > present.sum(-1))
+
+
 def make_estimate(
     prepared: Prepared,
     x: Float[Tensor, "B n"],
@@ -242,14 +256,7 @@ def make_estimate(
     tension = model.tension(x, markers.tension)
     report: LoadReport = model.coordinates.describe(gamma)
     covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *model.prior())[0])
-    present = markers.present
-    square = (prepared.w * sums.r**2)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
-    outlier = present & (square > _limit(3)) if math.isfinite(prepared.nu) else torch.zeros_like(present)
-    chi2 = cost - sums.cost[:, 0] + (square * ~outlier).sum(-1)
-    inside = present & ~outlier
-    dof = 3 * inside.sum(-1) + 6 + model.coordinates.informative_priors + model.tension_size - model.size
-    enough = 2 * inside.sum(-1) > present.sum(-1)  # a fit that leaves most of the markers aside explains nothing
-    limit = torch.tensor([_limit(k) for k in dof.tolist()], dtype=cost.dtype)
+    outlier, chi2, dof, explained = _verdict(prepared, sums, cost)
     residual = sums.r[:, :-6].unflatten(-1, (-1, 3))
     return Estimate(
         x=kept(x),
@@ -264,14 +271,14 @@ def make_estimate(
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
         centre_line=kept(sums.line),
-        residual=torch.where(present.unsqueeze(-1), kept(residual), torch.nan),
+        residual=torch.where(markers.present.unsqueeze(-1), kept(residual), torch.nan),
         tension=None if model.tension_std is None or tension is None else kept(tension),
         tension_std=None if model.tension_std is None else settled(tension_std(model, covariance)),
         outlier=outlier,
         cost=kept(cost),
         chi2=kept(chi2),
         dof=dof,
-        accepted=(chi2 < limit) & enough & (status == int(Status.CONVERGED)),
+        accepted=explained & (status == int(Status.CONVERGED)),
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..diagnosis import Diagnosis
 from ..errors import InputError
 from ..fit import Evidence, Fit
 from ..profile import Profile
@@ -109,10 +110,12 @@ def write_result(
     robot: str,
     evidence: Evidence | None = None,
     profile: Profile | None = None,
+    diagnosis: Diagnosis | None = None,
 ) -> None:
     """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
+    diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose).
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
@@ -121,6 +124,9 @@ def write_result(
         records = [result_record(estimate, b, name) for b, name in enumerate(samples)]
         for b, record in enumerate(records if evidence is not None else ()):
             record["evidence"] = _evidence(evidence, b)  # pyright: ignore[reportArgumentType]
+        for b, record in enumerate(records if diagnosis is not None else ()):
+            record["suspect_markers"] = diagnosis.suspects(b)  # pyright: ignore[reportOptionalMemberAccess]
+            record["message"] = f"{record['message']} {diagnosis.message(b)}".rstrip()  # pyright: ignore[reportOptionalMemberAccess]
         texts = [json.dumps(record, indent=1) for record in records]
         if profile is not None:
             texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]

@@ -1,0 +1,141 @@
+"""Exchanged labels, a base frame that is off, and a load too few: told where they are, and only there."""
+
+import json
+import math
+
+import roma
+import torch
+
+from tests.robots import T, steel_rod
+from tests.study import study1
+from torchrod import (
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PointForces,
+    Robot,
+    Settings,
+    Shapes,
+    diagnose,
+    estimate,
+    solve_shape,
+    write_shapes,
+)
+from torchrod.cli import main
+from torchrod.diagnosis import _misfit, _stretch
+
+ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"
+
+
+def model_of(robot: Robot, count: int = 1) -> Model:
+    return Model(robot, GaussianCoordinates(count, 0.4, robot.rod.force_scale))
+
+
+def noisy(count: int, seed: int = 3) -> Markers:
+    study = study1(count, seed)
+    generator = torch.Generator().manual_seed(seed)
+    return Markers(study.s, study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator))
+
+
+def off(positions: torch.Tensor) -> torch.Tensor:
+    """The base frame off by 5 mm and 3 degrees."""
+    R = roma.rotvec_to_rotmat(math.radians(3) * T([0.8, 0.6, 0.0]))
+    return positions @ R.T + 5e-3 * T([0.6, 0.0, 0.8])
+
+
+def exchanged(markers: Markers, pairs: list[tuple[int, int]]) -> Markers:
+    positions = markers.positions.clone()
+    for b, (i, j) in enumerate(pairs):
+        positions[b, [i, j]] = markers.positions[b, [j, i]]
+    return Markers(markers.s, positions)
+
+
+def test_the_cost_of_every_exchange_is_that_of_making_it():
+    """O(P^3) bookkeeping against exchanging and evaluating (1) anew; a missing marker and offsets included."""
+    generator = torch.Generator().manual_seed(0)
+    z, fitted = torch.randn(2, 5, 3, generator=generator), torch.randn(2, 5, 3, generator=generator)
+    z[1, 3] = torch.nan
+    markers = Markers(torch.linspace(0.1, 0.5, 5), z, 0.05 * torch.rand(5, 3, generator=generator))
+    after, beside = _stretch(markers, z), _misfit(fitted, z)
+    for i, j in ((0, 1), (1, 4), (2, 2), (0, 4)):
+        order = list(range(5))
+        order[i], order[j] = j, i
+        assert torch.allclose(_stretch(markers, z[:, order])[:, 2, 2], after[:, i, j])
+        assert torch.allclose((z[:, order] - fitted).square().sum(-1).nansum(-1), beside[:, i, j])
+
+
+def test_exchanged_labels_are_found_and_nothing_else():
+    """Neighbours 2 cm apart and far ones; the clean samples in between stay unsuspected, and the fit is not touched."""
+    pairs = [(6, 7), (0, 0), (2, 15), (18, 19), (5, 5), (0, 1), (3, 9), (10, 11)]
+    markers = exchanged(noisy(8), pairs)
+    model = model_of(steel_rod())
+    fit = estimate(model, markers, 1e-3)
+    diagnosis = diagnose([(model, torch.arange(8))], markers, 1e-3, fit)
+    assert [list(c) for c in diagnosis.exchanged] == [[] if i == j else [(i, j)] for i, j in pairs]
+    assert diagnosis.registration.isnan().all()
+    assert "Markers 7 and 8 (s = 140 and 160 mm) look exchanged" in diagnosis.message(0)
+    assert diagnosis.message(1) == ""
+    assert fit.residual[0].abs().max() > 5e-3, "the fit is that of the markers as they are labelled"
+
+
+def test_three_labels_in_a_ring_are_one_group():
+    markers = noisy(1)
+    positions = markers.positions.clone()
+    positions[0, [4, 9, 12]] = markers.positions[0, [9, 12, 4]]
+    markers = Markers(markers.s, positions)
+    model = model_of(steel_rod())
+    fit = estimate(model, markers, 1e-3)
+    diagnosis = diagnose([(model, torch.arange(1))], markers, 1e-3, fit)
+    assert diagnosis.suspects(0)[0]["markers"] == [5, 10, 13]
+    assert "5, 10 and 13" in diagnosis.message(0)
+
+
+def test_a_base_frame_that_is_off_is_told_with_its_size():
+    clean = noisy(6)
+    markers = Markers(clean.s, off(clean.positions))
+    model = model_of(steel_rod())
+    fit = estimate(model, markers, 1e-3)
+    diagnosis = diagnose([(model, torch.arange(6))], markers, 1e-3, fit)
+    assert not fit.accepted.any()
+    assert torch.isfinite(diagnosis.registration).all()
+    assert abs(diagnosis.registration[:, :3].norm(dim=-1).mean() - 5e-3) < 2e-3
+    assert abs(diagnosis.registration[:, 3:].norm(dim=-1).mean() - math.radians(3)) < math.radians(1)
+    assert "try --registration" in diagnosis.message(0)
+    assert not diagnosis.one_more.any()
+    unhurt = diagnose([(model, torch.arange(6))], clean, 1e-3, estimate(model, clean, 1e-3))
+    assert [unhurt.message(b) for b in range(6)] == [""] * 6
+
+
+def test_a_load_too_few_is_no_base_frame():
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    push = PointForces(T([[[0.8, 0.2, 0.0], [-0.6, 0.7, 0.0]]]), T([[0.15, 0.32]]))
+    markers = Markers(s, solve_shape(robot, (push,), None, s, 1).p)
+    model = model_of(robot)
+    fit = estimate(model, markers, 1e-3)
+    diagnosis = diagnose([(model, torch.arange(1))], markers, 1e-3, fit, Settings())
+    assert diagnosis.one_more[0]
+    assert diagnosis.registration.isnan().all()
+
+
+def test_the_command_line_tells(tmp_path, capsys):
+    """In the report and in RESULT.json, with one contact and with auto, and the samples beside them are as without."""
+    (tmp_path / "robot.toml").write_text(ROD)
+    clean = noisy(3)
+    positions = exchanged(clean, [(6, 11), (0, 0), (0, 0)]).positions
+    positions[1] = off(positions[1])
+    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(clean.s, positions), ["swapped", "moved", "clean"]))
+    for count in ("1", "auto"):
+        out = str(tmp_path / "result.json")
+        options = ["--contacts", count, "--out", out]
+        assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), *options]) == 0
+        said = capsys.readouterr().out
+        assert "Markers 7 and 12 (s = 140 and 240 mm) look exchanged" in said
+        assert "sample moved: " in said
+        assert "try --registration" in said
+        swapped, moved, unhurt = json.loads((tmp_path / "result.json").read_text())["results"]
+        (suspect,) = swapped["suspect_markers"]
+        assert suspect == {"markers": [7, 12], "s_m": clean.s[[6, 11]].tolist(), "suspicion": "exchanged"}
+        assert swapped["accepted"] is False
+        assert "try --registration" in moved["message"]
+        assert moved["suspect_markers"] == unhurt["suspect_markers"] == []
+        assert unhurt["message"] == "Converged."
