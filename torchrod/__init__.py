@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
     from .measurement import Markers, Model
+    from .noise import Noise, estimate_noise
     from .observability import Observability, bounds, load_bound
     from .placement import Placement, place
     from .plot import draw, draw_on
@@ -57,6 +58,7 @@ _HOMES = {
     "jacobian": ("forward_jacobian",),
     "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),
     "measurement": ("Markers", "Model"),
+    "noise": ("Noise", "estimate_noise"),
     "observability": ("Observability", "bounds", "load_bound"),
     "placement": ("Placement", "place"),
     "plot": ("draw", "draw_on"),
@@ -88,6 +90,7 @@ __all__ = [
     "InputError",
     "Markers",
     "Model",
+    "Noise",
     "Observability",
     "PaperCoordinates",
     "Placement",
@@ -113,6 +116,7 @@ __all__ = [
     "draw",
     "draw_on",
     "estimate",
+    "estimate_noise",
     "find_warm_start",
     "forward_jacobian",
     "load_bound",

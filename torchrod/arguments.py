@@ -5,6 +5,8 @@ from pathlib import Path
 
 from .errors import InputError
 
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+
 
 def positive(name: str, value: float) -> None:
     """Refuse what is not a positive number."""
@@ -22,6 +24,18 @@ def writable(path: str | None, suffixes: tuple[str, ...]) -> None:
         raise InputError(f"{path}: its folder does not exist; create it first")
     if Path(path).is_dir():
         raise InputError(f"{path}: is a folder; give a file name")
+
+
+def noise_or_auto(value: str) -> float | None:
+    """A standard deviation of the markers (m); None for auto."""
+    if value == "auto":
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        raise InputError(f"--noise is {value}; it must be auto or a standard deviation in metres") from None
+    noise_std(number)
+    return number
 
 
 def noise_std(value: float) -> None:

@@ -35,7 +35,9 @@ def _estimate_parser() -> ArgumentParser:
         default="contact",
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
-    parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
+    parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
+    parser.add_argument("--robust", action="store_true", help="let markers far off weigh little, and name them")
+    parser.add_argument("--tension-std", type=float, default=None, help="std of the tensions' sensors (N); else exact")
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
     parser.add_argument(

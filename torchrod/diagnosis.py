@@ -190,7 +190,7 @@ def _explained(
     tried = [(model, refused)] + [(_with_loads(model, k), everyone) for k in {1, count - 1} - {count}]
     for loads, index in tried if not model.registration else ():
         moved = None if loads is None else replace(loads, registration=True)
-        if moved is None or not len(index) or 3 * len(markers.s) < moved.size - 6:
+        if moved is None or not len(index) or 3 * len(markers.s) < moved.free_size:
             continue
         fit = estimate(moved, markers.take(index), noise, settings)
         assert fit.registration is not None
@@ -200,7 +200,7 @@ def _explained(
         zeta[index] = torch.where((score < by_frame[index]).unsqueeze(-1), fit.registration, zeta[index])
         by_frame[index] = torch.minimum(by_frame[index], score)
     more = _with_loads(model, count + 1)
-    if more is not None and len(refused) and 3 * len(markers.s) >= more.size - 6:
+    if more is not None and len(refused) and 3 * len(markers.s) >= more.free_size:
         fit = estimate(more, markers.take(refused), noise, settings)
         by_load[refused] = _bic(fit.accepted, fit.chi2, more, n[refused])
     best = torch.minimum(by_frame, torch.minimum(by_load, own))

@@ -185,8 +185,9 @@ def estimate(
 ) -> Estimate:
     """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
 
-    noise: standard deviation of a marker coordinate (m). start: where to start, from (model, markers, noise); a guess that is no
-    nearer to the data than a cold start is dropped, and one that leads to no accepted fit is followed by a cold start.
+    noise: standard deviation of a marker coordinate (m), where markers.sigma does not have one for each sample.
+    start: where to start, from (model, markers, noise); a guess that is no nearer to the data than a cold start is dropped, and one
+    that leads to no accepted fit is followed by a cold start.
     progress: called as samples finish, with their number. A sample's answer does not depend on its batch.
     Errors: ValueError for markers that do not fit the robot; a sample that cannot be estimated is reported by its status.
     Source: the paper, section II; DESIGN.md section 3.

@@ -37,13 +37,15 @@ class Markers:
     """Measured markers of B samples.
 
     s: (P,) m, arc lengths. positions: (B, P, 3) m, base frame, NaN where a marker is missing. offsets: (P, 3) m, from the centre
-    line in the section frame, so that the marker sits at p(s) + R(s) r. tension: (B, T) N for a tendon robot.
+    line in the section frame, so that the marker sits at p(s) + R(s) r. tension: (B, T) N for a tendon robot. sigma: (B,) m, each
+    sample's own noise, which then goes before the one that an estimate is given (torchrod.estimate_noise).
     """
 
     s: Float[Tensor, " P"]
     positions: Float[Tensor, "B P 3"]
     offsets: Float[Tensor, "P 3"] | None = None
     tension: Float[Tensor, "B T"] | None = None
+    sigma: Float[Tensor, " B"] | None = None
 
     @property
     def present(self) -> Bool[Tensor, "B P"]:
@@ -52,7 +54,8 @@ class Markers:
 
     def take(self, index: Int[Tensor, " b"]) -> "Markers":
         """The samples of an index."""
-        return Markers(self.s, self.positions[index], self.offsets, None if self.tension is None else self.tension[index])
+        tension, sigma = (None if x is None else x[index] for x in (self.tension, self.sigma))
+        return Markers(self.s, self.positions[index], self.offsets, tension, sigma)
 
 
 @dataclass(frozen=True)
@@ -218,7 +221,8 @@ class Model:
         """The diagonal of W: 1 / noise^2 for a marker that was seen, 0 for a missing one, then the tip residual's."""
         tip = self.tip_weights(markers.s)
         seen = markers.present.to(tip.dtype).repeat_interleave(3, -1)
-        return torch.cat([seen / noise**2, tip.expand(len(seen), 6)], -1)
+        variance = noise**2 if markers.sigma is None else markers.sigma.unsqueeze(-1) ** 2
+        return torch.cat([seen / variance, tip.expand(len(seen), 6)], -1)
 
     def exact_weights(self, w: Float[Tensor, "B z"]) -> Float[Tensor, "B z"]:
         """W with the tip residual ten times stiffer: for the covariance of the result, not for the way there.

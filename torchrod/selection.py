@@ -113,7 +113,7 @@ def select(
     fits: dict[str, tuple[Estimate, Int[Tensor, " b"]]] = {}
     for h, hypothesis in enumerate(hypotheses):
         model = hypothesis.model
-        if fit is not None and 3 * len(markers.s) < model.size - 6:
+        if fit is not None and 3 * len(markers.s) < model.free_size:
             continue
         index, begin = _needed(hypothesis, hypotheses, fits, markers, noise, start(model))
         if not len(index):

@@ -49,7 +49,7 @@ def linear_differences(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray
 
 
 def fit_differences(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, float]:
-    """Largest differences of finished fits, the share that ended elsewhere, and the share on which both say whether it converged."""
+    """Largest differences of finished fits, the share that ended elsewhere, and on how many both agree that it converged."""
     ours = {name: value[: len(theirs["x"])] for name, value in ours.items()}
     elsewhere = theirs["cost"] > ours["cost"] + DEARER
     both = ours["converged"] & theirs["converged"] & ~elsewhere

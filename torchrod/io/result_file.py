@@ -14,6 +14,7 @@ from torch import Tensor
 from ..diagnosis import Diagnosis
 from ..errors import InputError
 from ..fit import Evidence, Fit
+from ..noise import Noise
 from ..profile import Profile
 from ..result import Estimate
 from ..status import Status
@@ -77,6 +78,11 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     if estimate.registration is not None:
         twist = [_plain(v) for v in estimate.registration[b].tolist()]
         record["registration"] = {"translation_m": twist[:3], "rotation_rad": twist[3:]}
+    if estimate.tension is not None and estimate.tension_std is not None:
+        values, stds = ([_plain(v) for v in x[b].tolist()] for x in (estimate.tension, estimate.tension_std))
+        record["tensions"] = {"tension_N": values, "std": {"tension_N": stds}}
+    if bool(estimate.outlier[b].any()):
+        record["outliers"] = [i + 1 for i in estimate.outlier[b].nonzero().flatten().tolist()]
     return record
 
 
@@ -111,11 +117,12 @@ def write_result(
     evidence: Evidence | None = None,
     profile: Profile | None = None,
     diagnosis: Diagnosis | None = None,
+    noise: Noise | None = None,
 ) -> None:
     """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
-    diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose).
+    diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
@@ -127,6 +134,8 @@ def write_result(
         for b, record in enumerate(records if diagnosis is not None else ()):
             record["suspect_markers"] = diagnosis.suspects(b)  # pyright: ignore[reportOptionalMemberAccess]
             record["message"] = f"{record['message']} {diagnosis.message(b)}".rstrip()  # pyright: ignore[reportOptionalMemberAccess]
+        for b, record in enumerate(records if noise is not None else ()):
+            record["noise"] = {"noise_m": _plain(float(noise.sigma[b])), "std_m": _plain(float(noise.std[b]))}  # pyright: ignore[reportOptionalMemberAccess]
         texts = [json.dumps(record, indent=1) for record in records]
         if profile is not None:
             texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
@@ -137,6 +146,8 @@ def write_result(
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic}
     for name in ("magnitude_location_covariance", "location_interval"):
         arrays[name] = getattr(estimate, name)
+    if noise is not None:
+        arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
         arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
     np.savez_compressed(
