@@ -10,7 +10,6 @@ from scipy.stats import chi2 as chi2_distribution
 from torch import Tensor
 
 from . import ekf
-from .coordinates import LoadReport
 from .fast import Sums
 from .fit import Fit
 from .jacobian import pointwise_jacobian
@@ -203,11 +202,16 @@ def tip_covariance(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Te
     return torch.nn.functional.pad(block, (0, rest, 0, rest)) * scale * scale.unsqueeze(-1)
 
 
-def tension_std(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B T"]:
-    """Standard deviations of the tensions (N) after the fit."""
-    first = model.load_size
-    variance = covariance.diagonal(dim1=-2, dim2=-1)[:, first : first + model.tension_size]
-    return (model.tension_std or 0.0) * variance.clamp(min=0).sqrt()
+def _tensions(
+    prepared: Prepared, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]
+) -> tuple[Float[Tensor, "B T"], Float[Tensor, "B T"]] | None:
+    """The tensions (N) after the fit and their standard deviations, where they are unknown."""
+    model = prepared.model
+    tension = model.tension(x, prepared.markers.tension)
+    if model.tension_std is None or tension is None:
+        return None
+    variance = covariance.diagonal(dim1=-2, dim2=-1)[:, model.load_size : model.load_size + model.tension_size]
+    return tension, model.tension_std * variance.clamp(min=0).sqrt()
 
 
 @lru_cache(maxsize=4096)
@@ -240,8 +244,8 @@ def make_estimate(
 ) -> Estimate:
     """Assemble the result from the sums at x; a sample that is invalid holds NaN throughout."""
     model, markers = prepared.model, prepared.markers
-    normal = prepared.normal(sums)
-    _, _, cost = normal.whole(x, *model.prior())
+    normal, prior = prepared.normal(sums), model.prior()
+    cost = normal.whole(x, *prior)[2]
     valid = (status != int(Status.INVALID)) & torch.isfinite(cost)
     status = torch.where(valid, status, int(Status.INVALID))
 
@@ -253,11 +257,10 @@ def make_estimate(
         return torch.where((status == int(Status.CONVERGED)).reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
 
     gamma, zeta, alpha = model.split(x)
-    tension = model.tension(x, markers.tension)
-    report: LoadReport = model.coordinates.describe(gamma)
-    covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *model.prior())[0])
+    report = model.coordinates.describe(gamma)
+    covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *prior)[0])
+    free = _tensions(prepared, x, covariance)
     outlier, chi2, dof, explained = _verdict(prepared, sums, cost)
-    residual = sums.r[:, :-6].unflatten(-1, (-1, 3))
     return Estimate(
         x=kept(x),
         covariance=settled(covariance),
@@ -271,9 +274,9 @@ def make_estimate(
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
         centre_line=kept(sums.line),
-        residual=torch.where(markers.present.unsqueeze(-1), kept(residual), torch.nan),
-        tension=None if model.tension_std is None or tension is None else kept(tension),
-        tension_std=None if model.tension_std is None else settled(tension_std(model, covariance)),
+        residual=torch.where(markers.present.unsqueeze(-1), kept(sums.r[:, :-6].unflatten(-1, (-1, 3))), torch.nan),
+        tension=None if free is None else kept(free[0]),
+        tension_std=None if free is None else settled(free[1]),
         outlier=outlier,
         cost=kept(cost),
         chi2=kept(chi2),
