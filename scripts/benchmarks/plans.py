@@ -9,7 +9,9 @@ SHOWN = (256, 4096)  # the batches of the bars
 class Plan:
     """Batches, and the values along which growth is measured.
 
-    rounds: how often every path is asked in turn; budget: seconds that a timing takes. largest: the largest batch of a path that is slow. growing: the paths whose growth is measured, at `growth_batch` samples.
+    rounds: how often every path is asked in turn; budget: seconds that a timing takes. largest: the largest batch of a path that is
+    slow. growing: the paths whose growth is measured, at `growth_batch` samples. estimates: how many whole estimates of a path are
+    timed at once, "" for the others.
     """
 
     batches: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384, 65536)
