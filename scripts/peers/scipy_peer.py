@@ -4,6 +4,8 @@ The march takes many states at once: all the differences of a Jacobian (2-point)
 times faster than one after another.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import erf, expit
@@ -104,8 +106,8 @@ class ScipyPeer:
         def jacobian(x: np.ndarray) -> np.ndarray:
             return np.concatenate([root[:, None] * self.linearize(x[None])[1][0], np.diag(prior)])
 
-        stop = {"ftol": TOLERANCE, "xtol": 1e-10, "gtol": None, "max_nfev": 5 * MAX_ITERATIONS}
-        done = least_squares(residual, x, jacobian, method="trf", **stop)
+        stop: dict[str, Any] = {"jac": jacobian, "ftol": TOLERANCE, "xtol": 1e-10, "gtol": None, "max_nfev": 5 * MAX_ITERATIONS}
+        done = least_squares(residual, x, method="trf", **stop)
         H = self.linearize(done.x[None])[1][0]
         exact = np.append(w[:-6], TIP_EXACT * w[-6:])
         covariance = np.linalg.inv(H.T @ (exact[:, None] * H) + np.diag(p.prior_precision))
