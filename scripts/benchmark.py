@@ -42,7 +42,7 @@ def measured(names: list[str], plan: Plan, folder: Path, caches: Path) -> dict[s
     with tqdm(bar_format="{elapsed} {desc}") as bar:
         say = bar.set_description_str
         say("the machine's matrix product")
-        data: dict[str, Any] = {"machine": machine()}
+        data: dict[str, Any] = {"machine": machine(caches)}
         with workers(names, caches) as processes:
             say("the same answers?")
             data["agreement"] = checked(processes, folder)

@@ -55,7 +55,7 @@ def _floors(axes: Axes, floor: dict[str, float]) -> None:
 def figure(data: dict[str, Any], path: Path) -> None:
     """Batch on the left; steps, markers, loads and cores on the right."""
     picture = Figure(figsize=(13, 6.4), layout="constrained")
-    left, right = picture.subfigures(1, 2, width_ratios=[1.1, 1])
+    left, right = picture.subfigures(1, 2, width_ratios=[1.1, 1]).flat  # pyright: ignore[reportAttributeAccessIssue]
     axes = left.add_subplot()
     _draw(axes, data["iteration"])
     _floors(axes, data["machine"]["floor"])

@@ -1,6 +1,7 @@
 """The measurements: every path is asked in turn, round by round, and the fastest call of each counts."""
 
 import contextlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -23,27 +25,32 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "example"
 Progress = Callable[[str], None]
 
 
-def dgemm_rate(threads: int) -> float:
-    """Floating-point operations a second of a large float64 matrix product."""
+def dgemm_rate(threads: int, caches: Path) -> float:
+    """Floating-point operations a second of a large float64 matrix product: the better of torch's BLAS and numpy's."""
     a = torch.rand(MATRIX, MATRIX, dtype=torch.float64)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     taken = []
-    for _ in range(6):
+    for _ in range(10):
         begin = time.perf_counter()
         torch.mm(a, a)
         taken.append(time.perf_counter() - begin)
     torch.set_num_threads(before)
-    return 2 * MATRIX**3 / min(taken)
+    with Process("scipy", caches, threads) as process:
+        return max(2 * MATRIX**3 / min(taken), process.ask("dgemm")["rate"])
 
 
-def machine() -> dict[str, Any]:
+def machine(caches: Path) -> dict[str, Any]:
     """Where this was measured, and the floor of an iteration."""
     cores = len(os.sched_getaffinity(0))
     info = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").is_file() else ""
     model = next((line.split(":")[1].strip() for line in info.splitlines() if line.startswith("model name")), "unknown processor")
-    rates = {str(n): dgemm_rate(n) for n in sorted({1, cores})}
-    return {"processor": model, "cores": cores, "dgemm": rates, "floor": {n: FLOP / rate for n, rate in rates.items()}}
+    rates = {str(n): dgemm_rate(n, caches) for n in sorted({1, cores})}
+    versions = {
+        name: metadata.version(name) for name in ("torch", "numpy", "scipy", "numba", "jax") if importlib.util.find_spec(name)
+    }
+    floor = {n: FLOP / rate for n, rate in rates.items()}
+    return {"processor": model, "cores": cores, "versions": versions, "dgemm": rates, "floor": floor}
 
 
 @contextlib.contextmanager
@@ -140,11 +147,11 @@ def first_calls(names: list[str], plan: Plan, folder: Path, caches: Path, progre
     variable = {"torchrod": "TORCHROD_CACHE", "numba": "NUMBA_CACHE_DIR"}
     for name in names:
         kinds = ["from scratch", "cached"] if name in variable else ["from scratch"]
-        for kind in kinds if plan.numba_from_scratch or name != "numba" else ["cached"]:
+        for kind in [kind for kind in kinds if f"{name}, {kind}" not in plan.without_first_call]:
             progress(f"first call, {name}, {kind}")
             with tempfile.TemporaryDirectory() as empty:
                 more = {variable[name]: empty} if name in variable and kind == "from scratch" else {}
-                with Process(name, caches, **more) as process:
+                with Process(name, caches, more=more) as process:
                     took = process.ask("ready")
                     job = {"job": "iteration", "data": data, "batch": 1 if name == "scipy" else plan.growth_batch, "budget": 0.0}
                     found[f"{name}, {kind}"] = took | {"first_s": process.ask(**job)["first_s"]}

@@ -9,9 +9,9 @@ SHOWN = (256, 4096)  # the batches of the bars
 class Plan:
     """Batches, and the values along which growth is measured.
 
-    rounds: how often every path is asked in turn; budget: seconds that a timing takes.
-    largest: the largest batch of a path that is slow.
-    growing: the paths whose growth is measured, at `growth_batch` samples.
+    rounds: how often every path is asked in turn; budget: seconds that a timing takes. largest: the largest batch of a path that is
+    slow. growing: the paths whose growth is measured, at `growth_batch` samples. estimates: how many whole estimates of a path are
+    timed at once, "" for the others.
     """
 
     batches: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384, 65536)
@@ -28,7 +28,7 @@ class Plan:
     memory: tuple[int, ...] = (256, 4096, 65536)
     frames: int = 400
     commands: int = 3
-    numba_from_scratch: bool = True
+    without_first_call: tuple[str, ...] = ()
 
     def batch_of_estimates(self, name: str) -> int:
         """How many whole estimates of a path are timed at once."""
@@ -40,7 +40,7 @@ QUICK = Plan(
     batches=(1, 256, 4096),
     rounds=1,
     budget=0.15,
-    largest={"torchrod, eager": 1, "scipy": 1},
+    largest={"torchrod, eager": 0, "scipy": 1},
     growing=("torchrod", "numba"),
     steps=(20, 40, 80),
     markers=(10, 20, 40),
@@ -50,5 +50,5 @@ QUICK = Plan(
     memory=(256, 1024),
     frames=120,
     commands=1,
-    numba_from_scratch=False,
+    without_first_call=("torchrod, eager, from scratch", "numba, from scratch"),
 )

@@ -14,6 +14,7 @@ import peers
 from torchrod import fast
 
 SCRIPTS = Path(__file__).resolve().parents[1]
+ONLY = "import os, sys; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:{cores}]); os.execv(sys.argv[1], sys.argv[1:])"
 PATIENCE = 900  # seconds that a worker may take for a job
 TORCHROD = {"torchrod": {}, "torchrod, eager": {"TORCHROD_FAST": "0"}, "torchrod, compiled": {"TORCHROD_FAST": "compile"}}
 
@@ -35,11 +36,15 @@ def environment(name: str, caches: Path) -> dict[str, str]:
 class Process:
     """One worker; a context manager."""
 
-    def __init__(self, name: str, caches: Path, cores: int | None = None, **more: str):
+    def __init__(self, name: str, caches: Path, cores: int | None = None, more: dict[str, str] | None = None):
         self.name = name
-        command = [sys.executable, str(SCRIPTS / "benchmarks" / "worker.py"), name, *([] if cores is None else [str(cores)])]
+        command = [sys.executable, str(SCRIPTS / "benchmarks" / "worker.py"), name]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        self.process = subprocess.Popen(command, env=environment(name, caches) | more, **pipes)
+        own = environment(name, caches) | (more or {})
+        if cores is not None:
+            own |= {"OMP_NUM_THREADS": str(cores), "OPENBLAS_NUM_THREADS": str(cores)}
+            command = [sys.executable, "-c", ONLY.format(cores=cores), *command]
+        self.process = subprocess.Popen(command, env=own, **pipes)
 
     def ask(self, job: str, **arguments: Any) -> dict[str, Any]:
         """A job's answer. Errors: RuntimeError where the worker failed or took too long; it has said why on standard error."""

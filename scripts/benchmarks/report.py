@@ -90,7 +90,7 @@ def agreement_table(data: dict[str, Any]) -> list[str]:
     """By how much the paths differ."""
     rows = []
     for name, d in data["agreement"].items():
-        cells = [f"{d[what]:.1g}" for what in ("h", "H", "force", "location", "cost")]
+        cells = [f"{d[what]:.1g}" if what in d else "-" for what in ("h", "H", "x", "Sigma", "force", "location", "cost")]
         rows.append([label(name), str(d["samples"]), *cells, f"{100 * d['elsewhere']:.0f} %"])
     return table(
         ["against torchrod", "samples", "h (relative)", "H (relative)", "force (N)", "location (m)", "chi^2", "another minimum"],
@@ -115,6 +115,7 @@ def generated(data: dict[str, Any], options: str) -> str:
         "An iteration is h, H, the normal equations and the filter's update: one Gaussian with registration (16 unknowns), 20",
         f"markers, 40 RK4 steps. Its floor is 0.37 Mflop at the rate of a large matrix product ({rate}): {floor}.",
     ]
+    lines += ["Versions: " + ", ".join(f"{name} {version}" for name, version in m["versions"].items()) + "."]
     lines += ["", *bar_table(data), "", "![Time of an iteration](performance.png)", "", "### An iteration", ""]
     lines += [
         "Microseconds per sample, by batch (scipy: h and H by differences only):",

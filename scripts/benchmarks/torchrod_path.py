@@ -72,9 +72,10 @@ class TorchrodPeer:
 
     def frame_estimator(self) -> Callable[[np.ndarray], Any] | None:
         """One frame (P, 3) to its estimate, warm-started from what was before; None while torchrod has no such thing."""
-        if not hasattr(torchrod, "Estimator"):
+        kind: Any = getattr(torchrod, "Estimator", None)
+        if kind is None:
             return None
-        estimator = torchrod.Estimator(self.model, s=self.s, noise=self.case.noise)  # pyright: ignore[reportAttributeAccessIssue]
+        estimator = kind(self.model, s=self.s, noise=self.case.noise)
         return lambda positions: estimator(torch.from_numpy(positions))
 
 

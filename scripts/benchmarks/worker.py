@@ -1,11 +1,10 @@
-"""A process that measures one path or peer: python scripts/benchmarks/worker.py NAME [CORES].
+"""A process that measures one path or peer: python scripts/benchmarks/worker.py NAME.
 
 Reads a job a line (JSON) from standard input and answers with a line (JSON). One process per path keeps compilers, thread pools
 and memory apart; the parent asks them in turn, so that all are measured on the same machine in the same minutes.
 """
 
 import json
-import os
 import resource
 import sys
 import time
@@ -15,13 +14,8 @@ from typing import Any
 
 import numpy as np
 
-TRIES = 3  # at least so many calls, of which the fastest counts
-
-
-def limit_cores(cores: int) -> None:
-    """Before anything that makes threads is imported."""
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-    os.environ["OMP_NUM_THREADS"] = str(cores)
+TRIES = 3
+MATRIX = 1024
 
 
 class Worker:
@@ -52,6 +46,11 @@ class Worker:
         begin = time.perf_counter()
         __import__(PEERS[self.name][0] if self.name in PEERS else "benchmarks.torchrod_path")
         return {"import_s": time.perf_counter() - begin}
+
+    def dgemm(self) -> dict[str, Any]:
+        """Floating-point operations a second of a large float64 matrix product, by numpy's BLAS."""
+        a = np.random.default_rng(0).random((MATRIX, MATRIX))
+        return {"rate": 2 * MATRIX**3 / timed(lambda: a @ a, 0.5)["seconds"]}
 
     def iteration(self, data: str, batch: int, budget: float) -> dict[str, Any]:
         """Seconds of one iteration of the whole batch."""
@@ -85,10 +84,16 @@ class Worker:
         return {"seconds": [clocked(lambda seen=seen: frame(seen)) for seen in arrays["positions"]]}
 
     def answers(self, data: str, out: str, samples: int, fits: bool) -> dict[str, Any]:
-        """h and H, or finished fits, as a file."""
+        """h, H and the filter's next x and Sigma, or finished fits, as a file."""
         peer, arrays = self.case(data)
         x, start, positions = (arrays[name][:samples] for name in ("near", "start", "positions"))
-        found = vars(peer.estimate(start, positions)) if fits else dict(zip(("h", "H"), peer.linearize(x), strict=True))
+        if fits:
+            np.savez(out, **vars(peer.estimate(start, positions)))
+            return {}
+        found = dict(zip(("h", "H"), peer.linearize(x), strict=True))
+        if self.name != "scipy":  # which has no filter
+            Sigma, cap = np.tile(np.eye(x.shape[1]), (len(x), 1, 1)), np.full(len(x), np.inf)
+            found |= dict(zip(("x", "Sigma", "cap", "done"), peer.iterate(x, Sigma, cap, positions), strict=True))
         np.savez(out, **found)
         return {}
 
@@ -108,7 +113,15 @@ def repeated(array: np.ndarray, batch: int) -> np.ndarray:
 
 
 def peak_bytes() -> int:
-    """Of this process, up to now (Linux counts kilobytes)."""
+    """The largest resident size of this process, up to now.
+
+    By its own high-water mark where there is one (Linux): ru_maxrss also counts the parent that it was forked from.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        mark = next((line for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM:")), None)
+        if mark is not None:
+            return 1024 * int(mark.split()[1])
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
@@ -120,7 +133,10 @@ def clocked(what: Callable[[], object]) -> float:
 
 
 def timed(what: Callable[[], Any], budget: float, kernel: Callable[[], float | None] = lambda: None) -> dict[str, Any]:
-    """The first call, the fastest of at least TRIES further ones within a budget of seconds, and the kernel's share of that."""
+    """The first call, the fastest of further ones, and the kernel's share of that.
+
+    Further ones: TRIES or as many as a budget of seconds holds, but no more once they have taken three times the budget.
+    """
     taken, shares, value, first = [], [], None, clocked(what)
     while len(taken) < TRIES or sum(taken) < budget:
         before, begin = kernel(), time.perf_counter()
@@ -136,8 +152,6 @@ def timed(what: Callable[[], Any], budget: float, kernel: Callable[[], float | N
 
 def main() -> None:
     """Serve jobs until standard input ends."""
-    if len(sys.argv) > 2:
-        limit_cores(int(sys.argv[2]))
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     worker = Worker(sys.argv[1])
     answers, sys.stdout = sys.stdout, sys.stderr  # what a library prints must not be taken for an answer

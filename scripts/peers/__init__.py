@@ -80,7 +80,8 @@ class Problem:
 
     def save(self, path: Path, **more: np.ndarray) -> None:
         """As NPZ, with more arrays beside it."""
-        np.savez(path, **asdict(self), **more)
+        arrays: dict[str, Any] = asdict(self) | more
+        np.savez(path, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> tuple["Problem", dict[str, np.ndarray]]:

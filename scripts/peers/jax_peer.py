@@ -3,6 +3,9 @@
 Only loads and base wrench are differentiated through the march; a registration moves finished points.
 """
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any

@@ -1,5 +1,8 @@
 """One pass of the filter in numba, over a block of lanes."""
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import math
 from typing import NamedTuple
 

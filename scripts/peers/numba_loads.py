@@ -5,6 +5,9 @@ With r = sqrt(c), X(s) = r (s - mu), E = erf(X), T = X erf(X) + exp(-X^2) / sqrt
     g(s) = (E - E(0)) / D,    g2(s) = (T - T(0) - (X - X(0)) E(0)) / (r D),    G = F g,    G2 = F g2
 """
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import math
 
 from numba import njit

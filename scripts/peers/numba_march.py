@@ -5,13 +5,17 @@ whose constant strides let LLVM see that lanes do not touch. Only loads and base
 points), and the loads' integrals are evaluated once per node and midpoint.
 """
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import math
+from typing import Any
 
 from numba import njit
 
 LANES = 8
 # Fused multiply-adds, but nothing that assumes finite numbers; no exceptions, which would keep loops from being vectorized.
-HOT = {"fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy", "cache": True}
+HOT: dict[str, Any] = {"fastmath": {"contract", "arcp", "nsz"}, "error_model": "numpy", "cache": True}
 STATE = 13
 STAGE = 10  # q, N, M of a stage
 PARTS = 6  # of one load at one arc length: torchrod's G per newton and its derivatives in eta and log c, then the same of G2

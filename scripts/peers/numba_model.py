@@ -1,5 +1,8 @@
 """h(x) and dh/dx in numba, LANES samples at a time: loads, march, registration, and the normal equations they add up to."""
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import math
 from typing import NamedTuple
 

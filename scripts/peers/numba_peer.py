@@ -1,5 +1,8 @@
 """The estimator in numba: RK4 with analytic tangents of the discrete steps, all cores, eight samples to a vector."""
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +17,9 @@ from .numba_filter import advance, make_filter, posterior
 from .numba_march import HOT, LANES
 from .numba_model import Constants, make_work, march, marker_rows, tip_rows, turn
 
-FREE = HOT | {"nogil": True}  # for threads of our own: numba's parallel loops compile for twice as long and are no faster
+FREE: dict[str, Any] = HOT | {
+    "nogil": True
+}  # for threads of our own: numba's parallel loops compile for twice as long and are no faster
 CORES = len(os.sched_getaffinity(0))
 LARGEST_TASK = 512
 FULL_BLOCK = 3  # from so many samples on, eight lanes cost no more than as many single ones

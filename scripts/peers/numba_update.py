@@ -6,12 +6,16 @@ one vector register over a whole loop. (It would spoil the march, so it is on fo
 that none needs a test for being negative. What cannot be factored turns to NaN, in its own lane only, and is seen by the caller.
 """
 
+# Types are checked where the bench extra is not installed, too.
+# pyright: reportMissingImports=false
+
 import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import config, njit
+from numba import config as numba_config
+from numba import njit
 
 from .numba_march import HOT, LANES
 
@@ -23,6 +27,7 @@ def packed(signature: str) -> Callable[[Callable[..., None]], Any]:
     """Compile at once for a signature, with LLVM's vectorizer of straight code."""
 
     def compiled(function: Callable[..., None]) -> Any:
+        config: Any = numba_config
         before, config.SLP_VECTORIZE = config.SLP_VECTORIZE, 1
         try:
             return njit(signature, **HOT)(function)

@@ -4,6 +4,8 @@ The march takes many states at once: all the differences of a Jacobian (2-point)
 times faster than one after another.
 """
 
+from typing import Any
+
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import erf, expit
@@ -11,7 +13,7 @@ from scipy.special import erf, expit
 from . import MAX_ITERATIONS, TIP_EXACT, Fit, Problem, make_fit
 
 STEP = 1e-7  # of a difference: entries of x are of order one; between truncation and round-off
-TOLERANCE = 1e-6  # of the cost: a little tighter than the filter's test (MINPACK stops where a step promises and gains less)
+TOLERANCE = 1e-6  # of the cost: a little tighter than the filter's test
 ROOT_PI = np.sqrt(np.pi)
 
 
@@ -104,7 +106,8 @@ class ScipyPeer:
         def jacobian(x: np.ndarray) -> np.ndarray:
             return np.concatenate([root[:, None] * self.linearize(x[None])[1][0], np.diag(prior)])
 
-        done = least_squares(residual, x, jacobian, method="lm", ftol=TOLERANCE, xtol=1e-10, max_nfev=5 * MAX_ITERATIONS)
+        stop: dict[str, Any] = {"jac": jacobian, "ftol": TOLERANCE, "xtol": 1e-10, "gtol": None, "max_nfev": 5 * MAX_ITERATIONS}
+        done = least_squares(residual, x, method="trf", **stop)
         H = self.linearize(done.x[None])[1][0]
         exact = np.append(w[:-6], TIP_EXACT * w[-6:])
         covariance = np.linalg.inv(H.T @ (exact[:, None] * H) + np.diag(p.prior_precision))
