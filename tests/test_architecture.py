@@ -25,7 +25,7 @@ LAYERS = [
     {"probe", "diagnosis"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
-    {"profile"},
+    {"profile", "geometry"},
     {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},
     {"march"},
