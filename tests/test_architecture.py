@@ -26,7 +26,7 @@ LAYERS = [
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
     {"fit"},
-    {"prepared", "profile"},
+    {"prepared", "profile", "geometry"},
     {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},
     {"march"},

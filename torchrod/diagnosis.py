@@ -1,4 +1,4 @@
-"""Why does a fit not explain its markers? Labels exchanged, a base frame that is off, or a load too few. It only tells.
+"""Why does a fit not explain its markers? Labels exchanged, a base frame that is off, a load too few, the unit. It only tells.
 
 A rod of arc length s_j - s_i between two markers holds them no farther apart than that, whatever bends it (r: their offsets from
 the centre line):
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from .coordinates import GaussianCoordinates
 from .estimator import Settings, estimate, usable
+from .geometry import misplaced
 from .measurement import Markers, Model
 from .result import Estimate
 from .status import Status
@@ -38,13 +39,14 @@ class Diagnosis:
 
     s: (P,) m, of the markers. exchanged: per sample the groups of markers (counted from 0) whose labels look exchanged, mostly
     pairs. registration: (B, 6) [m, rad], an error of the base frame that explains the markers; NaN where none does. one_more: (B,),
-    where one more load does.
+    where one more load does. geometry: per sample what is wrong with its markers' unit, frame or order, or nothing.
     """
 
     s: Float[Tensor, " P"]
     exchanged: tuple[tuple[Cycle, ...], ...]
     registration: Float[Tensor, "B 6"]
     one_more: Bool[Tensor, " B"]
+    geometry: tuple[str, ...]
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
         """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
@@ -69,6 +71,8 @@ class Diagnosis:
             )
         if bool(self.one_more[sample]):
             said.append("One more contact explains the markers; try more --contacts.")
+        if self.geometry[sample]:
+            said.append(self.geometry[sample])
         return " ".join(said)
 
 
@@ -224,7 +228,9 @@ def diagnose(
     hasty = replace(settings or Settings(), restarts=(), max_iterations=ITERATIONS)
     exchanged: list[tuple[Cycle, ...]] = [()] * len(fit.status)
     registration = torch.full((len(fit.status), 6), torch.nan, dtype=torch.float64)
-    one_more = torch.zeros(len(fit.status), dtype=torch.bool)
+    one_more, geometry = torch.zeros(len(fit.status), dtype=torch.bool), [""] * len(fit.status)
+    for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():
+        geometry[b] = misplaced(markers, b, parts[0][0].robot.rod.length)
     for model, index in parts:
         chosen = len(parts) > 1 and model.load_size > 4
         doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & usable(model, markers.take(index))
@@ -233,8 +239,10 @@ def diagnose(
             found = _exchanged(model, markers.take(refused), noise, fit.residual[refused], fit.chi2[refused], hasty)
             for b, cycles in zip(refused.tolist(), found, strict=True):
                 exchanged[b] = cycles
-            rest = rows[[not exchanged[b] for b in rows.tolist()]]
+            for b in [b for b in refused.tolist() if not exchanged[b]]:
+                geometry[b] = misplaced(markers, b, model.robot.rod.length)
+            rest = rows[[not (exchanged[b] or geometry[b]) for b in rows.tolist()]]
             part, n = markers.take(rest), 3.0 * markers.present[rest].sum(-1)
             own = _bic(fit.accepted[rest], fit.chi2[rest], model, n)
             registration[rest], one_more[rest] = _explained(model, part, noise, own, hasty)
-    return Diagnosis(markers.s, tuple(exchanged), registration, one_more)
+    return Diagnosis(markers.s, tuple(exchanged), registration, one_more, tuple(geometry))

@@ -214,7 +214,8 @@ def check(model: Model, markers: Markers, noise: float) -> None:
         raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
     if 3 * len(markers.s) < model.free_size:
         raise ValueError(
-            f"{len(markers.s)} markers cannot determine {model.free_size} unknowns; add markers or drop loads or --registration"
+            f"{len(markers.s)} marker{'s' * (len(markers.s) > 1)} cannot determine {model.free_size} unknowns; "
+            "add markers or drop loads or --registration"
         )
     if tendons and markers.tension is None:
         raise ValueError(f"the robot has {tendons} tendons but the shapes carry no tensions; add tension_1..tension_{tendons}")

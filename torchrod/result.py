@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -249,13 +249,11 @@ def make_estimate(
     valid = (status != int(Status.INVALID)) & torch.isfinite(cost)
     status = torch.where(valid, status, int(Status.INVALID))
 
-    def kept(value: Tensor) -> Tensor:
-        return torch.where(valid.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
+    def where(mask: Bool[Tensor, " B"], value: Tensor) -> Tensor:
+        return torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
 
-    def settled(value: Tensor) -> Tensor:
-        """A spread only where the fit has settled: elsewhere it would look like knowledge."""
-        return torch.where((status == int(Status.CONVERGED)).reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
-
+    kept = partial(where, valid)
+    settled = partial(where, status == int(Status.CONVERGED))  # elsewhere a spread would look like knowledge
     gamma, zeta, alpha = model.split(x)
     report = model.coordinates.describe(gamma)
     covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *prior)[0])

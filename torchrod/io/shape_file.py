@@ -11,10 +11,11 @@ import numpy as np
 import torch
 
 from ..errors import InputError
+from ..geometry import nearest_reach, unit_hint
 from ..measurement import Markers
 from ..robot import Robot
 
-REACH = 3.0  # in rod lengths: markers typically farther from the base than this are in the wrong unit or frame
+REACH = 3.0  # in rod lengths: where even the nearest sample is typically farther from the base, unit or frame are wrong
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
 
@@ -38,12 +39,11 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     markers, L = shapes.markers, robot.rod.length
     outside = (markers.s < -1e-9) | (markers.s > L * (1 + 1e-9))
     if bool(outside.any()):
-        raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; s is in metres")
-    reach = markers.positions.norm(dim=-1).nanmedian() / L
+        hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
+        raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
+    reach = nearest_reach(markers.positions, L)
     if reach > REACH:
-        raise InputError(
-            f"{path}: positions lie {float(reach):.3g} rod lengths from the base; give metres in the robot's base frame"
-        )
+        raise InputError(f"{path}: positions reach {reach * L:.3g} m on a rod of {L:g} m; {unit_hint(reach)}")
     T = len(robot.tendons)
     if T and markers.tension is None:
         raise InputError(f"{path}: tensions are missing; the robot has {T} tendons, add tension_1..tension_{T} (N)")
