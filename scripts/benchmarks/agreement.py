@@ -15,7 +15,8 @@ from .processes import Process
 class Tolerance:
     """Largest relative error of h and of each column of H; of the filter's next x (its own units) and Sigma (relative).
 
-    And of a finished fit: force (N), location (m), cost (chi^2). elsewhere: the share of fits that may end at another, dearer minimum; they are counted and not compared.
+    And of a finished fit: force (N), location (m), cost (chi^2). elsewhere: the share of fits that
+    may end at another, dearer minimum; they are counted and not compared.
     """
 
     h: float = 1e-8

@@ -11,18 +11,18 @@ from typing import Any
 
 import peers
 
-from torchrod import fast
-
 SCRIPTS = Path(__file__).resolve().parents[1]
 ONLY = "import os, sys; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:{cores}]); os.execv(sys.argv[1], sys.argv[1:])"
 PATIENCE = 900  # seconds that a worker may take for a job
-TORCHROD = {"torchrod": {}, "torchrod, eager": {"TORCHROD_FAST": "0"}, "torchrod, compiled": {"TORCHROD_FAST": "compile"}}
+TORCHROD = {
+    "torchrod": {},
+    "torchrod, eager": {"TORCHROD_FAST": "0"},
+    "torchrod, compiled": {"TORCHROD_FAST": "0", "TORCHROD_COMPILE": "inductor"},
+}
 
 
 def available(name: str) -> bool:
     """Whether a path can be measured here."""
-    if name == "torchrod, compiled":
-        return "compile" in getattr(fast, "PATHS", ())
     return name in TORCHROD or peers.installed(name)
 
 

@@ -7,32 +7,24 @@ import numpy as np
 import torch
 from peers import Fit, Problem
 
-import torchrod
-from torchrod import Estimate, Markers, Model, Settings, cold_start, ekf, estimate, fast, find_warm_start
-from torchrod.estimator import CHUNK, linearize
+from torchrod import Estimate, Estimator, Markers, cold_start, ekf, estimate, fast, find_warm_start
+from torchrod.estimator import CHUNK
+from torchrod.prepared import Prepared
 
 from .cases import Case
 
-SETTINGS = Settings()
 Filtered = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def one_iteration(
-    model: Model, markers: Markers, noise: float, x: torch.Tensor, Sigma: torch.Tensor, cap: torch.Tensor
-) -> Filtered:
-    """One pass of the filter as torchrod.estimator does it: the next x, Sigma, cap, and who has converged.
+def one_iteration(prepared: Prepared, sums: fast.Sums, x: torch.Tensor, Sigma: torch.Tensor, cap: torch.Tensor) -> Filtered:
+    """One pass of the filter as torchrod.estimate does it: the next x, Sigma, cap, and who has converged.
 
-    This is what the tables call an iteration: h, H, the normal equations and the update.
+    This is what the tables call an iteration: h, H, the normal equations and the update. What is prepared once for all iterations
+    of a fit is not in it.
     """
-    w, markers_seen = model.weights(markers, noise), 3 * len(markers.s)
-    at = linearize(model, x, markers, w)
-    inflated = torch.minimum(ekf.inflation(w, markers_seen, at.decrement), cap)
-    A, g = ekf.information(at.H, at.r, ekf.adapted_weights(w, markers_seen, inflated), x, *model.prior())
-    step, Sigma = ekf.update(ekf.predict(Sigma, torch.ones_like(x[0])), A, g)
-    cap = torch.where((g * step).sum(-1) < 1.0, 0.1 * inflated, cap)
-    done = at.decrement < (1e-6 * at.cost).clamp(min=1e-3)
-    x = torch.where(done.unsqueeze(-1), x, x + ekf.limited(step, SETTINGS.step_limit))
-    return x, Sigma, cap, done
+    at = ekf.Iterate(x.clone(), Sigma.clone(), x.clone(), cap.clone(), torch.zeros(len(x), dtype=torch.bool))
+    prepared.iteration(at, Sigma, torch.ones_like(x[0]), ekf.Limits(), sums)(torch.arange(len(x)))
+    return at.x, at.Sigma, at.cap, at.done
 
 
 class TorchrodPeer:
@@ -41,6 +33,7 @@ class TorchrodPeer:
     def __init__(self, problem: Problem):
         self.case = Case(problem.loads, problem.registration, len(problem.keep), _steps(problem), problem.noise)
         self.model, self.s = self.case.model(), self.case.markers_at()
+        self._ready: tuple[np.ndarray | None, list[tuple[Prepared, fast.Sums]]] = (None, [])
 
     def markers(self, positions: np.ndarray) -> Markers:
         """Of some samples."""
@@ -54,12 +47,18 @@ class TorchrodPeer:
 
     def iterate(self, x: np.ndarray, Sigma: np.ndarray, cap: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `peers.Peer`; in the estimator's own chunks."""
+        if self._ready[0] is not positions:
+            self._ready = (positions, [self._prepared(positions[k : k + CHUNK]) for k in range(0, len(x), CHUNK)])
         parts = []
-        for first in range(0, len(x), CHUNK):
-            here = slice(first, first + CHUNK)
-            state = [torch.from_numpy(a[here]) for a in (x, Sigma, cap)]
-            parts.append(one_iteration(self.model, self.markers(positions[here]), self.case.noise, *state))
+        for k, (prepared, sums) in enumerate(self._ready[1]):
+            here = slice(k * CHUNK, (k + 1) * CHUNK)
+            parts.append(one_iteration(prepared, sums, *(torch.from_numpy(a[here]) for a in (x, Sigma, cap))))
         return tuple(torch.cat(part).numpy() for part in zip(*parts, strict=True))
+
+    def _prepared(self, positions: np.ndarray) -> tuple[Prepared, fast.Sums]:
+        markers = self.markers(positions)
+        prepared = Prepared(self.model, markers, self.model.weights(markers, self.case.noise))
+        return prepared, fast.Sums.room(len(positions), self.model.size, len(self.s))
 
     def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:
         """See `peers.Peer`; torchrod chooses its own cold start, which is x on this rod."""
@@ -70,19 +69,15 @@ class TorchrodPeer:
         rule = (find_warm_start(self.model) if start == "warm" else None) or cold_start
         return estimate(self.model, self.markers(positions), self.case.noise, start=rule)
 
-    def frame_estimator(self) -> Callable[[np.ndarray], Any] | None:
-        """One frame (P, 3) to its estimate, warm-started from what was before; None while torchrod has no such thing."""
-        kind: Any = getattr(torchrod, "Estimator", None)
-        if kind is None:
-            return None
-        estimator = kind(self.model, s=self.s, noise=self.case.noise)
+    def frame_estimator(self) -> Callable[[np.ndarray], Any]:
+        """One frame (P, 3) to its estimate, warm-started from what was before."""
+        estimator = Estimator(self.model, self.s, self.case.noise)
         return lambda positions: estimator(torch.from_numpy(positions))
 
 
-def kernel_seconds() -> float | None:
-    """Seconds spent in the compiled kernel so far; None where torchrod does not count them."""
-    count = getattr(fast, "seconds", None)
-    return None if count is None else float(count())
+def kernel_seconds() -> float:
+    """Seconds spent in the compiled kernel so far."""
+    return fast.seconds()
 
 
 def as_fit(fit: Estimate) -> Fit:
