@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from . import ekf
@@ -137,42 +137,61 @@ def _filter(
     return make_estimate(prepared, at.x, sums, status, iterations, start.warm)
 
 
-def _from_guess(
-    model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
-) -> Estimate:
-    """One chunk from its start: a guess that costs less than a cold start; cold also where it leads to no accepted fit."""
-    chosen, dropped = better_start(model, markers, noise, start, settings.initial_covariance(start.x))
-    fit = _filter(model, markers, noise, settings, chosen, progress)
+@dataclass(frozen=True)
+class _Chunk:
+    """Some samples, and how they are to be fitted."""
+
+    model: Model
+    markers: Markers
+    noise: float
+    settings: Settings
+
+    def take(self, index: Int[Tensor, " b"]) -> "_Chunk":
+        return replace(self, markers=self.markers.take(index))
+
+    def filtered(self, start: Start, progress: Callable[[int], object] = _silent) -> Estimate:
+        """The filter; on with Student's t from where the normal distribution's fit has ended, if so wished."""
+        normal = replace(self.settings, robust=math.inf)
+        fit = _filter(self.model, self.markers, self.noise, normal, start, progress)
+        if math.isinf(self.settings.robust):
+            return fit
+        again = Start(fit.x.nan_to_num(0.0), None, fit.warm_started)
+        onward = _filter(self.model, self.markers, self.noise, self.settings, again, _silent)
+        return replace(onward, iterations=fit.iterations + onward.iterations)
+
+    def cold(self) -> Estimate:
+        """From no load."""
+        return self.filtered(cold_start(self.model, self.markers, self.noise))
+
+    def restarted(self, fit: Estimate) -> Estimate:
+        """The fit, and where it is not accepted again from other magnitudes."""
+        hasty = replace(self.settings, max_iterations=min(self.settings.max_iterations, RESTART_ITERATIONS))
+        coordinates = self.model.coordinates
+        for factor in self.settings.restarts if coordinates.size else ():
+            index = (~fit.accepted & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
+            if not len(index):
+                break
+            part = replace(self.take(index), settings=hasty)
+            gamma = coordinates.rescaled(fit.x[index, : coordinates.size], factor)
+            x = self.model.join(gamma, equilibrium_wrench(self.model, coordinates.loads(gamma), part.markers))
+            fit = fit.improved_by(part.filtered(Start(x, None, torch.zeros(len(x), dtype=torch.bool))), index)
+        return fit
+
+
+def _fitted(chunk: _Chunk, start: Start, progress: Callable[[int], object]) -> Estimate:
+    """From a guess that costs less than a cold start; where no accepted fit comes of it, all that would come of a cold start."""
+    model, markers, settings = chunk.model, chunk.markers, chunk.settings
+    chosen, dropped = better_start(model, markers, chunk.noise, start, settings.initial_covariance(start.x))
+    fit = chunk.filtered(chosen, progress)
     failed = chosen.warm & ~fit.accepted & usable(model, markers)
     learned = torch.where(start.warm, int(Learned.USED), int(Learned.NONE))
     learned[dropped], learned[failed] = int(Learned.DROPPED), int(Learned.RETRIED)
     fit = replace(fit, learned=learned)
     index = failed.nonzero().squeeze(-1)
-    if not len(index):
-        return fit
-    part = markers.take(index)
-    return fit.improved_by(_filter(model, part, noise, settings, cold_start(model, part, noise), _silent), index)
-
-
-def _with_restarts(
-    model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
-) -> Estimate:
-    """One chunk, on with Student's t if so wished, and again from other magnitudes where the fit is not accepted."""
-    fit = _from_guess(model, markers, noise, replace(settings, robust=math.inf), start, progress)
-    if math.isfinite(settings.robust):
-        onward = _filter(model, markers, noise, settings, Start(fit.x.nan_to_num(0.0), None, fit.warm_started), _silent)
-        fit = replace(onward, iterations=fit.iterations + onward.iterations, restarts=fit.restarts, learned=fit.learned)
-    again = replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS))
-    for factor in settings.restarts if model.coordinates.size else ():
-        index = (~fit.accepted & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
-        if not len(index):
-            break
-        part = markers.take(index)
-        gamma = model.coordinates.rescaled(fit.x[index, : model.coordinates.size], factor)
-        x = model.join(gamma, equilibrium_wrench(model, model.coordinates.loads(gamma), part))
-        other = _filter(model, part, noise, again, Start(x, None, torch.zeros(len(x), dtype=torch.bool)), _silent)
-        fit = fit.improved_by(other, index)
-    return fit
+    if len(index):
+        again = chunk.take(index)
+        fit = fit.improved_by(again.restarted(again.cold()), index)
+    return chunk.restarted(fit)
 
 
 def estimate(
@@ -197,8 +216,8 @@ def estimate(
     size = CHUNK if served(model, markers.positions) else CHUNK_TORCH
     for first in range(0, len(markers.positions), size):
         index = torch.arange(first, min(first + size, len(markers.positions)))
-        part = markers.take(index)
-        parts.append(_with_restarts(model, part, noise, settings or Settings(), start(model, part, noise), progress))
+        chunk = _Chunk(model, markers.take(index), noise, settings or Settings())
+        parts.append(_fitted(chunk, start(model, chunk.markers, noise), progress))
     return Estimate.cat(parts)
 
 

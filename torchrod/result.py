@@ -157,7 +157,7 @@ class Estimate:
                 changed[f.name][index[better]] = getattr(other, f.name)[better]
         changed["learned"] = self.learned
         changed["iterations"] = self.iterations.index_add(0, index, other.iterations)
-        changed["restarts"] = self.restarts.index_add(0, index, torch.ones_like(index))
+        changed["restarts"] = self.restarts.index_add(0, index, 1 + other.restarts)
         return replace(self, **changed)
 
     @staticmethod
