@@ -15,7 +15,8 @@ from .processes import Process
 class Tolerance:
     """Largest relative error of h and of each column of H; of the filter's next x (its own units) and Sigma (relative).
 
-    And of a finished fit: force (N), location (m), cost (chi^2). elsewhere: the share of fits that may end at another, dearer minimum; they are counted and not compared.
+    And of a finished fit: force (N), location (m), cost (chi^2). elsewhere: the share of fits that may end at another, dearer
+    minimum; they are counted and not compared.
     """
 
     h: float = 1e-8
@@ -45,7 +46,7 @@ class Disagreement(Exception):
 
 def linear_differences(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest differences of h, H and, where there is a filter, of one pass of it; infinite where one is not finite."""
-    size = {name: np.abs(ours[name]) for name in theirs if name in ("h", "H", "x", "Sigma")}
+    size = {name: np.abs(ours[name]) for name in ("h", "H", "x", "Sigma") if name in ours and name in theirs}
     off = {name: np.abs(theirs[name] - ours[name][: len(theirs[name])]) for name in size}
     values = {"h": off["h"].max() / size["h"].max(), "H": (off["H"].max((0, 1)) / size["H"].max((0, 1))).max()}
     if "x" in off:
