@@ -8,12 +8,16 @@ import peers
 import pytest
 from benchmarks.agreement import Disagreement, Tolerance, fit_differences, linear_differences, verify
 from benchmarks.bars import bars, ratios
-from benchmarks.cases import ITERATION, STUDY, write
+from benchmarks.cases import ITERATION, STUDY, write, write_frames
 from benchmarks.figure import figure
 from benchmarks.plans import FULL, QUICK
 from benchmarks.processes import Process
 from benchmarks.report import BEGIN, END, generated, write_page
-from benchmarks.torchrod_path import TorchrodPeer
+from benchmarks.torchrod_path import TorchrodPeer, kernel_seconds
+from benchmarks.worker import Worker, timed
+
+import torchrod
+from torchrod import fast
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -149,6 +153,29 @@ def test_scipy_fits_as_torchrod_does(folder):
     ours, theirs = (one.estimate(start, positions) for one in (TorchrodPeer(problem), peers.peer("scipy", problem)))
     off = fit_differences(vars(ours), vars(theirs))
     assert off["force"] < 5e-3 and off["location"] < 2e-4 and off["elsewhere"] == 0 and off["converged"] == 1
+
+
+def test_frames_go_through_an_estimator_once_torchrod_has_one(folder, monkeypatch):
+    worker = Worker("torchrod")
+    film = str(write_frames(3, folder))
+
+    class Frames:
+        def __init__(self, model, s, noise):
+            assert model.size == 10 and len(s) == 20 and noise == STUDY.noise
+
+        def __call__(self, positions):
+            assert positions.shape == (20, 3)
+
+    monkeypatch.setattr(torchrod, "Estimator", Frames, raising=False)
+    assert len(worker.frames(film)["seconds"]) == 3
+
+
+def test_the_kernel_s_share_is_taken_where_torchrod_counts_it(monkeypatch):
+    monkeypatch.setattr(fast, "seconds", lambda: 1.5, raising=False)
+    assert kernel_seconds() == 1.5
+    clock = iter(range(100))
+    assert timed(lambda: None, 0.0, lambda: next(clock))["kernel_share"] > 0
+    assert timed(lambda: 3, 0.0)["kernel_share"] is None
 
 
 @pytest.mark.parametrize("name", ["numba", "jax"])

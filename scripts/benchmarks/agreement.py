@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .cases import ITERATION, STUDY, write
+from .cases import ITERATION, STUDY, Case, write
 from .processes import Process
 
 
@@ -15,8 +15,8 @@ from .processes import Process
 class Tolerance:
     """Largest relative error of h and of each column of H; of the filter's next x (its own units) and Sigma (relative).
 
-    And of a finished fit: force (N), location (m), cost (chi^2). elsewhere: the share of fits that
-    may end at another, dearer minimum; they are counted and not compared.
+    And of a finished fit: force (N), location (m), cost (chi^2). elsewhere: the share of fits that may end at another, dearer
+    minimum; they are counted and not compared.
     """
 
     h: float = 1e-8
@@ -30,11 +30,12 @@ class Tolerance:
     samples: int = 64
 
 
+OTHER = Case(loads=3, markers=10, steps=80)  # what grows is right, too
 DEARER = 1.0  # of chi^2: another minimum
 # scipy takes differences, has its own test of convergence, which leaves it elsewhere in the flat valley of the width, and nothing
 # that keeps it from another minimum.
 TOLERANCES = {
-    "scipy": Tolerance(H=1e-5, force=5e-3, location=2e-4, cost=5e-3, elsewhere=0.25, samples=4),
+    "scipy": Tolerance(H=3e-5, force=5e-3, location=2e-4, cost=5e-3, elsewhere=0.25, samples=4),
     "torchrod, eager": Tolerance(samples=16),
 }
 CHECKED = ("h", "H", "x", "Sigma", "force", "location", "cost", "elsewhere")
@@ -46,7 +47,7 @@ class Disagreement(Exception):
 
 def linear_differences(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest differences of h, H and, where there is a filter, of one pass of it; infinite where one is not finite."""
-    size = {name: np.abs(ours[name]) for name in theirs if name in ("h", "H", "x", "Sigma")}
+    size = {name: np.abs(ours[name]) for name in ("h", "H", "x", "Sigma") if name in ours and name in theirs}
     off = {name: np.abs(theirs[name] - ours[name][: len(theirs[name])]) for name in size}
     values = {"h": off["h"].max() / size["h"].max(), "H": (off["H"].max((0, 1)) / size["H"].max((0, 1))).max()}
     if "x" in off:
@@ -74,15 +75,15 @@ def verify(name: str, found: dict[str, float], tolerance: Tolerance) -> None:
         raise Disagreement(f"{name} and torchrod converge on different samples: they agree on {100 * found['converged']:.0f} %")
 
 
-def answers(process: Process, folder: Path, samples: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """h and H of the case with the registration, and fits of the one without, as a worker finds them."""
+def answers(process: Process, folder: Path, samples: int) -> list[dict[str, np.ndarray]]:
+    """What a worker finds: h, H and a pass of the filter of two cases, and fits of Study 1."""
     found = []
-    for case, fits in ((ITERATION, False), (STUDY, True)):
+    for case, fits in ((ITERATION, False), (OTHER, False), (STUDY, True)):
         out = folder / f"{process.name.replace(', ', '-')}-{case.name}-answers.npz"
         process.ask("answers", data=str(write(case, folder)), out=str(out), samples=samples, fits=fits)
         with np.load(out) as file:
             found.append(dict(file))
-    return found[0], found[1]
+    return found
 
 
 def checked(processes: dict[str, Process], folder: Path) -> dict[str, dict[str, Any]]:
@@ -91,7 +92,7 @@ def checked(processes: dict[str, Process], folder: Path) -> dict[str, dict[str, 
     Errors: Disagreement.
     """
     limits = {name: TOLERANCES.get(name, Tolerance()) for name in processes}
-    for case in (ITERATION, STUDY):
+    for case in (ITERATION, OTHER, STUDY):
         write(case, folder)
     with ThreadPoolExecutor() as pool:
         asked = {name: pool.submit(answers, process, folder, limits[name].samples) for name, process in processes.items()}
@@ -99,7 +100,8 @@ def checked(processes: dict[str, Process], folder: Path) -> dict[str, dict[str, 
     found: dict[str, dict[str, Any]] = {}
     reference = said.pop("torchrod")
     for name, theirs in said.items():
-        found[name] = linear_differences(reference[0], theirs[0]) | fit_differences(reference[1], theirs[1])
+        one, two = (linear_differences(a, b) for a, b in zip(reference[:2], theirs[:2], strict=True))
+        found[name] = {what: max(one[what], two[what]) for what in one} | fit_differences(reference[2], theirs[2])
         verify(name, found[name], limits[name])
         found[name]["samples"] = limits[name].samples
     return found

@@ -27,6 +27,8 @@ def _number(value: float, _: int) -> str:
 def _draw(axes: Axes, by_path: dict[str, dict[str, float]]) -> None:
     """One line a path, logarithmic both ways."""
     for name, times in by_path.items():
+        if not times:
+            continue
         x = sorted(times, key=int)
         y = [MICRO * times[v] for v in x]
         weight = {"lw": 2.2, "zorder": 4} if name == "torchrod" else {"lw": 1.4, "zorder": 3}

@@ -43,7 +43,7 @@ def columns(by_path: dict[str, dict[str, float]]) -> list[str]:
 def times_table(first: str, by_path: dict[str, dict[str, float]]) -> list[str]:
     """Microseconds per sample, paths down, values across."""
     values = columns(by_path)
-    rows = [[label(name), *[micro(times.get(v)) for v in values]] for name, times in by_path.items()]
+    rows = [[label(name), *[micro(times.get(v)) for v in values]] for name, times in by_path.items() if times]
     return table([first, *[f"{int(v):,}" for v in values]], rows)
 
 
@@ -57,7 +57,7 @@ def ratio_table(data: dict[str, Any]) -> list[str]:
     """torchrod's compiled path over the others."""
     others = data["ratios"]["torchrod"]
     values = columns(others)
-    rows = [[label(name), *[f"{r[v]:.3g}" if v in r else "-" for v in values]] for name, r in others.items()]
+    rows = [[label(name), *[f"{r[v]:.3g}" if v in r else "-" for v in values]] for name, r in others.items() if r]
     return table(["torchrod's time over that of", *[f"{int(v):,}" for v in values]], rows)
 
 
@@ -92,10 +92,8 @@ def agreement_table(data: dict[str, Any]) -> list[str]:
     for name, d in data["agreement"].items():
         cells = [f"{d[what]:.1g}" if what in d else "-" for what in ("h", "H", "x", "Sigma", "force", "location", "cost")]
         rows.append([label(name), str(d["samples"]), *cells, f"{100 * d['elsewhere']:.0f} %"])
-    return table(
-        ["against torchrod", "samples", "h (relative)", "H (relative)", "force (N)", "location (m)", "chi^2", "another minimum"],
-        rows,
-    )
+    head = ["against torchrod", "samples", "h (relative)", "H (relative)", "next x", "next Sigma (relative)"]
+    return table([*head, "force (N)", "location (m)", "chi^2", "another minimum"], rows)
 
 
 def generated(data: dict[str, Any], options: str) -> str:

@@ -90,7 +90,7 @@ class Worker:
         if fits:
             np.savez(out, **vars(peer.estimate(start, positions)))
             return {}
-        found = dict(zip(("h", "H"), peer.linearize(x), strict=True))
+        found: dict[str, Any] = dict(zip(("h", "H"), peer.linearize(x), strict=True))
         if self.name != "scipy":  # which has no filter
             Sigma, cap = np.tile(np.eye(x.shape[1]), (len(x), 1, 1)), np.full(len(x), np.inf)
             found |= dict(zip(("x", "Sigma", "cap", "done"), peer.iterate(x, Sigma, cap, positions), strict=True))
