@@ -47,10 +47,9 @@ void torchrod_march(const March* m, int64_t threads) {
     const Known& known = m->known;
     const int64_t n = m->tangents, g = m->load_tangents, points = 3 * known.steps;
     in_groups(m->batch, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
-        Group group{&known, lanes, g, 0, 0, nullptr, nullptr, nullptr, {}, {}, nullptr};
-        if (known.tendons) room.balance.resize(4 * known.steps), group.balance = room.balance.data();
+        Group group{&known, lanes, n, g, 0, 0, nullptr, nullptr, nullptr, {}, {}};
         if (m->local) {
-            room.local.resize(points * (1 + g) * PARTS);
+            room.local.resize((points + 1) * (1 + g) * PARTS);
             for (int64_t p = 0; p < points; p++)
                 for (int part = 0; part < PARTS; part++) {
                     const int64_t at = p * 6 + part;
@@ -60,25 +59,22 @@ void torchrod_march(const March* m, int64_t threads) {
                 }
             group.local = room.local.data();
         }
-        auto run = [&](auto K, int64_t first) {
-            Dual<K()> y[13];
-            for (int c = 0; c < 13; c++) {
-                y[c] = constant<K()>(fetch({m->y0, 13}, lanes, c));
-                for (int j = 0; j < K(); j++) y[c].d[j] = fetch({m->dy0, 13 * n}, lanes, c * n + first + j);
-            }
-            walk<K(), false>(group, y, first, m->reverse, [&](int64_t p, Mask here, const Dual<K()>* y) {
-                for (int64_t l = 0; l < lanes.count; l++) {
-                    if (!here[l]) continue;
-                    const int64_t to = (lanes.sample[l] * known.outputs + p) * 13;
-                    for (int c = 0; c < 13; c++) {
-                        m->out[to + c] = y[c].v[l];
-                        for (int j = 0; j < K(); j++) m->dout[(to + c) * n + first + j] = y[c].d[j][l];
-                    }
+        V y[STATE];
+        room.tangents.resize(n * STATE);
+        for (int c = 0; c < STATE; c++) {
+            y[c] = fetch({m->y0, STATE}, lanes, c);
+            for (int64_t j = 0; j < n; j++) room.tangents[j * STATE + c] = fetch({m->dy0, STATE * n}, lanes, c * n + j);
+        }
+        walk(group, y, room.tangents.data(), m->reverse, [&](int64_t p, Mask here) {
+            for (int64_t l = 0; l < lanes.count; l++) {
+                if (!here[l]) continue;
+                const int64_t to = (lanes.sample[l] * known.outputs + p) * STATE;
+                for (int c = 0; c < STATE; c++) {
+                    m->out[to + c] = y[c][l];
+                    for (int64_t j = 0; j < n; j++) m->dout[(to + c) * n + j] = room.tangents[j * STATE + c][l];
                 }
-            });
-        };
-        if (n == 0) run(std::integral_constant<int, 0>{}, 0);
-        else in_blocks(n, run);
+            }
+        });
     });
 }
 

@@ -2,7 +2,7 @@
 // These structures are mirrored in structures.py.
 #pragma once
 
-#include "dual.h"
+#include "lanes.h"
 
 struct Table {  // null where there is none; stride 0: shared, else numbers per sample
     const double* data;

@@ -1,8 +1,6 @@
 // Integrals of the loads and how they move with gamma: the compiled copy of torchrod/loads.py under torchrod/coordinates.
 #pragma once
 
-#include <vector>
-
 #include "march.h"
 
 enum Family : int64_t { NONE = 0, GAUSSIAN = 1, PAPER = 2, POINT = 3, LINEAR = 4 };

@@ -61,8 +61,7 @@ struct Motion {
 
 // Room for one group, kept from group to group.
 struct Room {
-    std::vector<V> local, moves, rows, line, tension;
-    std::vector<Balance> balance;
+    std::vector<V> local, moves, rows, line, tension, tangents;
 };
 
 struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the centre line in the rod's own frame
@@ -72,106 +71,107 @@ struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the cen
     V* H(int64_t z) const { return rows + z * width + 1; }
 };
 
-template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, Room& room) {
+template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, bool slopes, Room& room) {
     const Known& m = f.known;
+    const int64_t g = f.loads.size;
     room.tension.resize(f.tensions);
-    for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(f.loads.size + f.tip + t);
-    Group g{&m, lanes, f.loads.size, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active, nullptr};
-    if (m.tendons) room.balance.resize(4 * m.steps), g.balance = room.balance.data();
+    for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(g + f.tip + t);
+    Group group{&m, lanes, slopes ? g + f.tensions + PLAIN : 0, g, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active};
     if (f.loads.family == POINT) {
-        room.moves.resize((m.steps + 1) * f.loads.size);
-        move_nodes(f.loads, g, x, room.moves.data());
-        g.node_moves = room.moves.data();
+        room.moves.resize((m.steps + 1) * g);
+        move_nodes(f.loads, group, x, room.moves.data());
+        group.node_moves = room.moves.data();
     }
     if (f.loads.family != NONE) {
-        room.local.resize((3 * m.steps + 1) * (1 + f.loads.size) * PARTS);
-        fill_local(f.loads, g, x, room.local.data());
-        g.local = room.local.data();
+        room.local.resize((3 * m.steps + 1) * (1 + g) * PARTS);
+        fill_local(f.loads, group, x, room.local.data());
+        group.local = room.local.data();
     }
-    return g;
+    return group;
 }
 
-// One block of tangents: K of them from `first` in the order of Group.
-template <int K, bool Moving, class X>
-void measure_block(const Fit& f, const Group& g, X x, const Motion& motion, int64_t first, const Measured& to) {
-    const Known& m = f.known;
-    const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
-    auto column = [&](int64_t j) { return j < f.loads.size ? j : j < fixed ? f.tip + j : n - PLAIN + j - fixed; };
-    Dual<K> y[13];
-    for (auto& c : y) c = constant<K>(V{});
-    y[6].v = splat(1.0);
-    for (int i = 0; i < 6; i++) {
-        const double unit = i < 3 ? f.force_unit : f.moment_unit;
-        y[7 + i].v = unit * x(n - PLAIN + i);
-        if (i < 3 && m.Wn.data) y[7 + i].v -= fetch(m.Wn, g.lanes, i);
-        for (int j = 0; j < K; j++)
-            if (first + j - fixed == i) y[7 + i].d[j] = splat(unit);
+// Writes what one output shows: rows of h, and of dh/dx for every tangent, the j-th of which is column(j) of x.
+template <class X> struct Show {
+    const Fit& f;
+    const Group& g;
+    X x;
+    const Motion& motion;
+    const Measured& to;
+    const V *y, *dy;
+
+    int64_t column(int64_t j) const {
+        const int64_t fixed = f.loads.size + f.tensions;
+        return j < f.loads.size ? j : j < fixed ? f.tip + j : f.size - PLAIN + j - fixed;
     }
-    auto put = [&](Mask here, int64_t z, const Dual<K>& value) {
-        to.h(z) = select(here, value.v, to.h(z));
-        for (int j = 0; j < K; j++) {
-            V& slot = to.H(z)[column(first + j)];
-            slot = select(here, value.d[j], slot);
+    void put(Mask here, int64_t z, const V3& value) const {
+        for (int i = 0; i < 3; i++) to.h(z + i) = select(here, value.c[i], to.h(z + i));
+    }
+    void put(Mask here, int64_t z, int64_t at, const V3& value) const {
+        for (int i = 0; i < 3; i++) to.H(z + i)[at] = select(here, value.c[i], to.H(z + i)[at]);
+    }
+    void marker(int64_t p, Mask here) const {
+        const V3 q = part(y + 3);
+        V3 r = part(y);
+        V J[12];
+        for (int i = 0; i < 3; i++) to.line[3 * p + i] = select(here, r.c[i], to.line[3 * p + i]);
+        if (f.offsets) {
+            const V3 offset{splat(f.offsets[3 * p]), splat(f.offsets[3 * p + 1]), splat(f.offsets[3 * p + 2])};
+            r = r + turned(q, y[6], offset);
+            turning(q, y[6], 1, offset, J);
         }
-    };
-    walk<K, Moving>(g, y, first, false, [&](int64_t p, Mask here, const Dual<K>* y) {
-        const Vec<K> q{y[3], y[4], y[5]}, back = -q;
-        const Dual<K>& w = y[6];
-        if (p < P) {
-            Vec<K> r{y[0], y[1], y[2]};
-            for (int i = 0; i < 3; i++) to.line[3 * p + i] = select(here, r.c[i].v, to.line[3 * p + i]);
-            if (f.offsets) {
-                Vec<K> offset;
-                for (int i = 0; i < 3; i++) offset.c[i] = constant<K>(splat(f.offsets[3 * p + i]));
-                r = r + turned(q, w, offset);
-            }
-            if (f.registration) {
-                const int64_t zeta = n - 2 * PLAIN;
-                for (int i = 0; i < 3; i++) {
-                    const V* R = motion.R + 3 * i;
-                    put(here, 3 * p + i, R[0] * r.c[0] + R[1] * r.c[1] + R[2] * r.c[2] + motion.t[i]);
-                    for (int k = 0; k < 3; k++) {
-                        const V* dR = motion.dR[k] + 3 * i;
-                        V &shift = to.H(3 * p + i)[zeta + k], &turn = to.H(3 * p + i)[zeta + 3 + k];
-                        shift = splat(i == k ? f.length_unit : 0.0);
-                        turn = select(here, f.angle_unit * (dR[0] * r.c[0].v + dR[1] * r.c[1].v + dR[2] * r.c[2].v), turn);
-                    }
-                }
-            } else {
-                for (int i = 0; i < 3; i++) put(here, 3 * p + i, r.c[i]);
-            }
-            return;
+        for (int64_t j = 0; j < g.tangents; j++) {
+            const V* d = dy + j * STATE;
+            V3 dr = part(d);
+            if (f.offsets) dr = dr + matvec4(J, d + 3);
+            put(here, 3 * p, column(j), f.registration ? matvec(motion.R, dr) : dr);
         }
-        Vec<K> force{y[7], y[8], y[9]}, moment{y[10], y[11], y[12]};
-        Stage<K> beyond;
-        local_of(g, 3 * m.steps, first, beyond);
-        force = force - beyond.G;
-        moment.c[0] = moment.c[0] - beyond.G2y, moment.c[1] = moment.c[1] + beyond.G2x;
-        for (int block = 0; block < f.tip / 3; block++) {
-            Vec<K>& c = block ? moment : force;
-            const double unit = block ? f.moment_unit : f.force_unit;
-            Vec<K> unknown;
-            for (int k = 0; k < 3; k++) {
-                const int64_t at = f.loads.size + 3 * block + k;
-                unknown.c[k] = constant<K>(unit * x(at));
-                Vec<K> axis{constant<K>(V{}), constant<K>(V{}), constant<K>(V{})};
-                axis.c[k].v = splat(unit);
-                const Vec<K> seen = turned(back, w, axis);
-                for (int i = 0; i < 3; i++) to.H(3 * P + 3 * block + i)[at] = -seen.c[i].v;
-            }
-            c = c - turned(back, w, unknown);
+        if (!f.registration) return put(here, 3 * p, r);
+        put(here, 3 * p, matvec(motion.R, r) + part(motion.t));
+        for (int64_t k = 0; g.tangents && k < 3; k++) {
+            V3 shift{};
+            shift.c[k] = splat(f.length_unit);
+            put(here, 3 * p, f.size - 2 * PLAIN + k, shift);
+            put(here, 3 * p, f.size - 2 * PLAIN + 3 + k, splat(f.angle_unit) * matvec(motion.dR[k], r));
         }
-        for (int i = 0; i < 3; i++) put(here, 3 * P + i, force.c[i]), put(here, 3 * P + 3 + i, moment.c[i]);
-    });
-}
+    }
+    void tip(Mask here) const {
+        const int64_t P = f.known.outputs - 1;
+        const V* l = g.local_at(3 * f.known.steps);
+        const V3 q = part(y + 3), back = V3{} - q;
+        for (int half = 0; half < 2; half++) {
+            const int64_t z = 3 * P + 3 * half;
+            V3 c = part(y + 7 + 3 * half), unknown{};
+            V J[12];
+            if (l) c = c - (half ? V3{l[4], -l[3], V{}} : part(l));
+            const bool free = f.tip > 3 * half;
+            for (int k = 0; free && k < 3; k++) {
+                const int64_t at = f.loads.size + 3 * half + k;
+                V3 axis{};
+                axis.c[k] = splat(half ? f.moment_unit : f.force_unit);
+                unknown.c[k] = (half ? f.moment_unit : f.force_unit) * x(at);
+                if (g.tangents) put(here, z, at, V3{} - turned(back, y[6], axis));
+            }
+            if (free) c = c - turned(back, y[6], unknown), turning(q, y[6], -1, unknown, J);
+            put(here, z, c);
+            for (int64_t j = 0; j < g.tangents; j++) {
+                const V *d = dy + j * STATE, *dl = g.local_slope(3 * f.known.steps, j);
+                V3 dc = part(d + 7 + 3 * half);
+                if (dl) dc = dc - (half ? V3{dl[4], -dl[3], V{}} : part(dl));
+                if (free) dc = dc - matvec4(J, d + 3);
+                put(here, z, column(j), dc);
+            }
+        }
+    }
+};
 
 // h and H of the samples in the lanes. x(j): entry j of their states. Without `slopes` h alone.
 template <class X> Measured measure(const Fit& f, const Lanes& lanes, X x, bool slopes, Room& room) {
-    const int64_t n = f.size, P = f.known.outputs - 1;
+    const Known& m = f.known;
+    const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
     room.rows.assign((3 * P + PLAIN) * (1 + n), V{});
     room.line.assign(3 * P, V{});
     const Measured to{room.rows.data(), room.line.data(), 1 + n};
-    const Group g = group_of(f, lanes, x, room);
+    const Group g = group_of(f, lanes, x, slopes, room);
     Motion motion;
     if (f.registration) {
         V translation[3], turn[3];
@@ -181,12 +181,20 @@ template <class X> Measured measure(const Fit& f, const Lanes& lanes, X x, bool 
         }
         motion = Motion(translation, turn);
     }
-    if (!slopes) measure_block<0, false>(f, g, x, motion, 0, to);
-    else
-        in_blocks(f.loads.size + f.tensions + PLAIN, [&](auto K, int64_t first) {
-            if (g.node_moves) measure_block<K(), true>(f, g, x, motion, first, to);
-            else measure_block<K(), false>(f, g, x, motion, first, to);
-        });
+    V y[STATE] = {};
+    y[6] = splat(1.0);
+    room.tangents.assign(g.tangents * STATE, V{});
+    for (int i = 0; i < 6; i++) {
+        const double unit = i < 3 ? f.force_unit : f.moment_unit;
+        y[7 + i] = unit * x(n - PLAIN + i);
+        if (i < 3 && m.Wn.data) y[7 + i] -= fetch(m.Wn, g.lanes, i);
+        if (slopes) room.tangents[(fixed + i) * STATE + 7 + i] = splat(unit);
+    }
+    const Show<X> show{f, g, x, motion, to, y, room.tangents.data()};
+    walk(g, y, room.tangents.data(), false, [&](int64_t p, Mask here) {
+        if (p < P) show.marker(p, here);
+        else show.tip(here);
+    });
     return to;
 }
 

@@ -1,18 +1,16 @@
-// One arc-length step: the same operations as torchrod/step.py and torchrod/tendons.py on dual numbers. The torch step is the
-// definition; tests/test_fast.py holds this copy to it, values and Jacobians.
+// One arc-length step's right-hand side and its slope: the same operations as torchrod/step.py and torchrod/tendons.py, and their
+// derivative. The torch step is the definition; tests/test_fast.py and test_fit.py hold this copy to it, values and Jacobians.
 #pragma once
 
 #include "known.h"
 
 constexpr int MOST_TENDONS = 16;
 
-// All that is known at one stage, for the samples in the lanes. Wn may move with a node; dtau is what frees a tension.
-template <int K> struct Stage {
-    bool Gm_there, Wn_there, Wm_there;
-    Vec<K> G, Wn;
-    Dual<K> G2x, G2y;
-    V Gm[3], Wm[3], u_star[3];
-    V L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], tau[MOST_TENDONS], dtau[MOST_TENDONS][K ? K : 1];
+// All that is known at one stage, for the samples in the lanes.
+struct Stage {
+    bool Wn_there, Wm_there;
+    V3 G, Gm, Wn, Wm, u_star;
+    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
 };
 
 INLINE void inverse3(const V* A, V* R) {  // rows of R: cofactors of the columns of A
@@ -55,8 +53,8 @@ struct Balance {
 };
 
 // tendons.py, balanced_strains: the values.
-template <int K> void balance(const Known& m, const Stage<K>& at, const V* w, Balance& b) {
-    const V star[6] = {V{}, V{}, splat(1.0), at.u_star[0], at.u_star[1], at.u_star[2]};
+inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
+    const V star[6] = {V{}, V{}, splat(1.0), at.u_star.c[0], at.u_star.c[1], at.u_star.c[2]};
     for (int i = 0; i < 6; i++) b.x[i] = star[i];
     for (int iteration = 0; iteration <= m.newton; iteration++) {
         V misfit[6], J[36];
@@ -96,70 +94,90 @@ template <int K> void balance(const Known& m, const Stage<K>& at, const V* w, Ba
     }
 }
 
-// Strains of the whole section's wrench. The tangents of the last Newton step are inverse (dw - sum dtau g). `settled`: the values
-// are those of an earlier block of tangents.
-template <int K>
-INLINE void strains(const Known& m, const Stage<K>& at, const Vec<K>& N, const Vec<K>& M, Balance* kept, bool settled, Vec<K>& v,
-                    Vec<K>& u) {
-    if (m.tendons) {
-        if (!settled) {
-            const V w[6] = {N.c[0].v, N.c[1].v, N.c[2].v, M.c[0].v, M.c[1].v, M.c[2].v};
-            balance(m, at, w, *kept);
-        }
-        for (int i = 0; i < 6; i++) (i < 3 ? v.c[i] : u.c[i - 3]) = constant<K>(kept->x[i]);
-        for (int j = 0; j < K; j++) {
-            V dw[6] = {N.c[0].d[j], N.c[1].d[j], N.c[2].d[j], M.c[0].d[j], M.c[1].d[j], M.c[2].d[j]};
-            for (int64_t t = 0; t < m.tendons; t++)
-                for (int i = 0; i < 6; i++) dw[i] -= at.dtau[t][j] * kept->g[6 * t + i];
-            for (int i = 0; i < 6; i++) {
-                V d = V{};
-                for (int k = 0; k < 6; k++) d += kept->inverse[6 * i + k] * dw[k];
-                (i < 3 ? v.c[i] : u.c[i - 3]).d[j] = d;
-            }
-        }
-    } else if (m.diagonal) {
-        for (int i = 0; i < 3; i++) v.c[i] = m.K_se_inverse[4 * i] * N.c[i], u.c[i] = m.K_bt_inverse[4 * i] * M.c[i] + at.u_star[i];
-        v.c[2].v += 1.0;
-    } else {
-        for (int i = 0; i < 3; i++) {
-            const double *A = m.K_se_inverse + 3 * i, *B = m.K_bt_inverse + 3 * i;
-            v.c[i] = A[0] * N.c[0] + A[1] * N.c[1] + A[2] * N.c[2];
-            u.c[i] = B[0] * M.c[0] + B[1] * M.c[1] + B[2] * M.c[2] + at.u_star[i];
-        }
-        v.c[2].v += 1.0;
-    }
-}
+// What the derivative of one evaluation of (1)-(4) needs of its values. Jv (3, 4): of R v by q; Jn, Jm: of R^T Wn and R^T Wm.
+struct Slope {
+    V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS];
+    V3 q, u, v, N, N_turning, M_turning;
+    bool Jn_there, Jm_there;
+    Balance balance;
+};
 
 // step.py, derivative: (1)-(4). The parts of the wrench that turn with the section come first; what keeps its direction in the
-// base frame is added to them. No aggregate is copied: the compiler would call memmove.
-template <int K> __attribute__((noinline)) void derivative(const Known& m, const Dual<K>* y, const Stage<K>& at, Balance* kept, bool settled, Dual<K>* dy) {
-    const Vec<K>& q = *reinterpret_cast<const Vec<K>*>(y + 3);
-    const Vec<K>& N_tilde = *reinterpret_cast<const Vec<K>*>(y + 7);
-    const Vec<K>& M_tilde = *reinterpret_cast<const Vec<K>*>(y + 10);
-    const Dual<K>& w = y[6];
-    Vec<K> N_turning = N_tilde - at.G, M_turning, dead_force, dead_moment, v, u;
-    M_turning.c[0] = M_tilde.c[0] - at.G2y;  // e3 x G2 = (-G2_y, G2_x, 0)
-    M_turning.c[1] = M_tilde.c[1] + at.G2x;
-    M_turning.c[2] = M_tilde.c[2] + V{};
-    if (at.Gm_there)
-        for (int i = 0; i < 3; i++) M_turning.c[i] = M_turning.c[i] - at.Gm[i];
-    const Vec<K>*N = &N_turning, *M = &M_turning;
-    if (at.Wn_there) dead_force = N_turning + turned(-q, w, at.Wn), N = &dead_force;
-    if (at.Wm_there) {
-        const Vec<K> Wm{constant<K>(at.Wm[0]), constant<K>(at.Wm[1]), constant<K>(at.Wm[2])};
-        dead_moment = M_turning + turned(-q, w, Wm), M = &dead_moment;
+// base frame is added to them.
+inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope& s) {
+    s.q = part(y + 3), s.w = y[6];
+    s.N_turning = part(y + 7) - at.G;
+    s.M_turning = part(y + 10) - at.Gm;
+    s.M_turning.c[0] -= at.G2y;  // e3 x G2 = (-G2_y, G2_x, 0)
+    s.M_turning.c[1] += at.G2x;
+    const V3 back = V3{} - s.q;
+    s.N = s.N_turning, s.Jn_there = at.Wn_there, s.Jm_there = at.Wm_there;
+    V3 M = s.M_turning;
+    if (at.Wn_there) s.N = s.N + turned(back, s.w, at.Wn), turning(s.q, s.w, -1, at.Wn, s.Jn);
+    if (at.Wm_there) M = M + turned(back, s.w, at.Wm), turning(s.q, s.w, -1, at.Wm, s.Jm);
+    if (m.tendons) {
+        const V w[6] = {s.N.c[0], s.N.c[1], s.N.c[2], M.c[0], M.c[1], M.c[2]};
+        balance(m, at, w, s.balance);
+        s.v = part(s.balance.x), s.u = part(s.balance.x + 3);
+        for (int64_t t = 0; t < m.tendons; t++) s.tau_unit[t] = at.tau_unit[t];
+    } else {
+        s.v = matvec(m.K_se_inverse, s.N), s.u = at.u_star + matvec(m.K_bt_inverse, M);
+        s.v.c[2] += 1.0;
     }
-    strains(m, at, *N, *M, kept, settled, v, u);
+    for (int k = 0; k < 3; k++) {
+        V3 axis{};
+        axis.c[k] = splat(1.0);
+        const V3 column = turned(s.q, s.w, axis);
+        for (int i = 0; i < 3; i++) s.R[3 * i + k] = column.c[i];
+    }
+    turning(s.q, s.w, 1, s.v, s.Jv);
     // dp = R v, dq = q (u, 0) / 2, dN~ = -u x (N~ - G), dM~ = -u x (M - R^T Wm) - v x N - e3 x G
-    const Vec<K> p_rate = turned(q, w, v), q_rate = cross(q, u), N_rate = cross(N_turning, u), M_rate = cross(M_turning, u),
-                 couple = cross(*N, v);
-    for (int i = 0; i < 3; i++) {
-        dy[i] = p_rate.c[i];
-        dy[3 + i] = 0.5 * (w * u.c[i] + q_rate.c[i]);
-        dy[7 + i] = N_rate.c[i];
-        dy[10 + i] = M_rate.c[i] + couple.c[i];
+    const V3 p = matvec(s.R, s.v), q = s.w * s.u + cross(s.q, s.u), N = cross(s.N_turning, s.u),
+             couple = cross(s.M_turning, s.u) + cross(s.N, s.v);
+    for (int i = 0; i < 3; i++) dy[i] = p.c[i], dy[3 + i] = 0.5 * q.c[i], dy[7 + i] = N.c[i], dy[10 + i] = couple.c[i];
+    dy[10] += at.G.c[1], dy[11] -= at.G.c[0];
+    dy[6] = -0.5 * dot(s.q, s.u);
+}
+
+// What moves with one tangent at one stage, beside the state: the local loads [G, G2_x, G2_y], Wn, and the tension of one tendon.
+struct Moves {
+    const V* local;   // (5) or null
+    const V3* Wn;     // or null
+    int64_t tension;  // whose unknown this tangent is, or -1
+};
+
+// The derivative of `derivative` along one tangent z of the state. Plain: no tendons and no loads of the base frame.
+template <bool Plain> INLINE void slope(const Known& m, const Slope& s, const V* z, const Moves& moves, V* dk) {
+    V3 dNt = part(z + 7), dMt = part(z + 10), shear{};
+    if (moves.local) {
+        const V* l = moves.local;
+        dNt = dNt - V3{l[0], l[1], l[2]};
+        dMt.c[0] -= l[4], dMt.c[1] += l[3];
+        shear = {l[1], -l[0], V{}};
     }
-    dy[10] = dy[10] + at.G.c[1];
-    dy[11] = dy[11] - at.G.c[0];
-    dy[6] = -0.5 * (q.c[0] * u.c[0] + q.c[1] * u.c[1] + q.c[2] * u.c[2]);
+    V3 dN = dNt, dM = dMt, dv, du;
+    if (!Plain) {
+        if (moves.Wn) dN = dN + *moves.Wn;
+        if (s.Jn_there) dN = dN + matvec4(s.Jn, z + 3);
+        if (s.Jm_there) dM = dM + matvec4(s.Jm, z + 3);
+    }
+    if (!Plain && m.tendons) {
+        V dw[6] = {dN.c[0], dN.c[1], dN.c[2], dM.c[0], dM.c[1], dM.c[2]}, dx[6];
+        if (moves.tension >= 0)
+            for (int i = 0; i < 6; i++) dw[i] -= s.tau_unit[moves.tension] * s.balance.g[6 * moves.tension + i];
+        for (int i = 0; i < 6; i++) {
+            dx[i] = V{};
+            for (int k = 0; k < 6; k++) dx[i] += s.balance.inverse[6 * i + k] * dw[k];
+        }
+        dv = part(dx), du = part(dx + 3);
+    } else if (m.diagonal) {
+        for (int i = 0; i < 3; i++) dv.c[i] = m.K_se_inverse[4 * i] * dN.c[i], du.c[i] = m.K_bt_inverse[4 * i] * dM.c[i];
+    } else {
+        dv = matvec(m.K_se_inverse, dN), du = matvec(m.K_bt_inverse, dM);
+    }
+    const V3 dq = part(z + 3), p = matvec(s.R, dv) + matvec4(s.Jv, z + 3), q = s.w * du + z[6] * s.u + cross(dq, s.u) + cross(s.q, du),
+             N = cross(dNt, s.u) + cross(s.N_turning, du),
+             M = cross(dMt, s.u) + cross(s.M_turning, du) + cross(dN, s.v) + cross(s.N, dv) + shear;
+    for (int i = 0; i < 3; i++) dk[i] = p.c[i], dk[3 + i] = 0.5 * q.c[i], dk[7 + i] = N.c[i], dk[10 + i] = M.c[i];
+    dk[6] = -0.5 * (dot(dq, s.u) + dot(s.q, du));
 }
