@@ -1,6 +1,6 @@
 """The compiled library: built from the C++ beside this file with the machine's own compiler, cached, and loaded with ctypes.
 
-Where there is no compiler the torch path does the same, more slowly, and a warning says so once. A build takes about ten seconds
+Where there is no compiler the torch path does the same, more slowly, and a warning says so once. A build takes about five seconds
 and happens once per machine: it goes on by itself while the torch path serves, and whoever asks after it is finished gets the
 library. TORCHROD_FAST=0 switches it off; TORCHROD_CACHE names another folder for it (default ~/.cache/torchrod).
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 SOURCES = sorted([*FOLDER.glob("*.h"), *FOLDER.glob("*.cpp")])
-FLAGS = ("-O2", "-march=native", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-pthread", "-Wno-psabi")
+FLAGS = ("-O3", "-march=native", "-std=c++17", "-shared", "-fPIC", "-fno-math-errno", "-pthread", "-Wno-psabi")
 PATIENCE = 2.0  # s that a first estimate waits for a build
 GIVE_UP = 300.0  # s after which a build is held to be dead
 
