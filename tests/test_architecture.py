@@ -22,7 +22,7 @@ LAYERS = [
     {"io", "plot", "selection"},
     {"calibration", "placement"},
     {"unloaded", "observability"},
-    {"probe", "diagnosis"},
+    {"probe", "diagnosis", "frame"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
     {"profile", "geometry"},

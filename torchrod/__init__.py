@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .diagnosis import Diagnosis, diagnose
     from .errors import InputError
     from .estimator import Settings, estimate, paper_settings
+    from .frame import BaseFrame, common_frame
     from .io import Dataset, Shapes, read_dataset, read_dataset_spec, read_robot, read_shapes, write_result, write_shapes
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
@@ -41,6 +42,7 @@ _HOMES = {
     "diagnosis": ("Diagnosis", "diagnose"),
     "errors": ("InputError",),
     "estimator": ("Settings", "estimate", "paper_settings"),
+    "frame": ("BaseFrame", "common_frame"),
     "io": (
         "Dataset",
         "Shapes",
@@ -69,6 +71,7 @@ _HOMES = {
 }
 __all__ = [
     "Actuated",
+    "BaseFrame",
     "Calibration",
     "Dataset",
     "DatasetSpec",
@@ -104,6 +107,7 @@ __all__ = [
     "bounds",
     "calibrate",
     "cold_start",
+    "common_frame",
     "diagnose",
     "draw",
     "draw_on",

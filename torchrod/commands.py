@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jsonargparse import Namespace
@@ -16,6 +17,8 @@ from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
 from .features import features
+from .frame import STEPS as FRAME_STEPS
+from .frame import common_frame
 from .io import (
     RESULT_SUFFIXES,
     read_fit,
@@ -26,7 +29,7 @@ from .io import (
 from .measurement import Markers, Model
 from .observability_command import observability
 from .profile import Profile, joined_profile
-from .result import Estimate
+from .result import Estimate, Evidence
 from .robot import Robot
 from .selection import Hypothesis, select
 from .simulate_command import simulate, simulate_dataset
@@ -68,6 +71,8 @@ def estimate(options: Namespace) -> None:
     positive("--max-iterations", options.max_iterations)
     writable(options.out, RESULT_SUFFIXES)
     writable(options.plot, FIGURE_SUFFIXES)
+    if options.one_frame and not options.registration:
+        raise InputError("--one-frame says that all samples share what --registration estimates; give --registration as well")
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
@@ -77,19 +82,21 @@ def estimate(options: Namespace) -> None:
 
     settings = Settings(max_iterations=options.max_iterations)
     candidates = _hypotheses(options, count, model)
-    start_of, evidence = _starts(options, [c.model for c in candidates], shapes.markers), None
     try:
-        if len(candidates) > 1:
-            result, evidence = select(candidates, shapes.markers, options.noise, settings, start_of, _bar)
-        else:
-            only = candidates[0].model
-            with _bar(len(shapes.samples), f"{count} contact{'s' * (count != 1)}") as bar:
-                result = run_estimate(only, shapes.markers, options.noise, settings, start_of(only), bar.update)
+        start_of = _starts(options, [c.model for c in candidates], shapes.markers)
+        result, evidence = _fitted(candidates, shapes.markers, options.noise, settings, start_of)
+        markers, fitted_by = shapes.markers, _fitted_by(candidates, evidence, len(shapes.samples))
+        if options.one_frame:
+            with _bar(FRAME_STEPS * len(shapes.samples), "base frame") as bar:
+                frame = common_frame(fitted_by, markers, options.noise, result, settings, bar.update)
+            markers = frame.corrected(markers)
+            candidates = [replace(c, model=replace(c.model, registration=False)) for c in candidates]
+            result, evidence = _fitted(candidates, markers, options.noise, settings, start_of)
+            fitted_by = _fitted_by(candidates, evidence, len(shapes.samples))
+            result = frame.widened(fitted_by, markers, options.noise, result)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
-    choice = torch.zeros(len(shapes.samples), dtype=torch.int64) if evidence is None else evidence.choice
-    fitted_by = [(c.model, (choice == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
-    diagnosis = diagnose(fitted_by, shapes.markers, options.noise, result, settings)
+    diagnosis = diagnose(fitted_by, markers, options.noise, result, settings)
     print(_report(result, shapes.samples, diagnosis))  # noqa: T201
     if options.out or options.plot:
         profile = joined_profile(fitted_by, result.x, result.covariance)
@@ -97,6 +104,23 @@ def estimate(options: Namespace) -> None:
             write_result(options.out, result, shapes.samples, robot.name, evidence, profile, diagnosis)
         if options.plot:
             _draw(options.plot, robot, shapes.markers, result, shapes.samples, profile)
+
+
+def _fitted(
+    candidates: list[Hypothesis], markers: Markers, noise: float, settings: Settings, start_of: Callable[[Model], StartRule]
+) -> tuple[Estimate, Evidence | None]:
+    """The fit by the only model there is, or by the one that each sample asks for."""
+    if len(candidates) > 1:
+        return select(candidates, markers, noise, settings, start_of, _bar)
+    only = candidates[0]
+    with _bar(len(markers.positions), f"{only.contacts} contact{'s' * (only.contacts != 1)}") as bar:
+        return run_estimate(only.model, markers, noise, settings, start_of(only.model), bar.update), None
+
+
+def _fitted_by(candidates: list[Hypothesis], evidence: Evidence | None, samples: int) -> list[tuple[Model, torch.Tensor]]:
+    """Every model with the samples that it was chosen for."""
+    choice = torch.zeros(samples, dtype=torch.int64) if evidence is None else evidence.choice
+    return [(c.model, (choice == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
 
 
 def _hypotheses(options: Namespace, count: int | None, model: Callable[[int, str, str], Model]) -> list[Hypothesis]:
