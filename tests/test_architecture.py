@@ -22,7 +22,7 @@ LAYERS = [
     {"io", "plot", "selection"},
     {"calibration", "placement"},
     {"unloaded", "observability"},
-    {"probe", "stream", "diagnosis", "noise"},
+    {"probe", "stream", "diagnosis", "noise", "frame"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
     {"fit"},

@@ -74,7 +74,7 @@ def test_the_bound_is_that_of_the_whole_state():
     _, H = model.linearized(x, markers)
     H = torch.cat([H[..., :3], H[..., 4:]], -1)
     w = model.exact_weights(model.weights(markers, 1e-3))
-    A = H.mT @ (w.unsqueeze(-1) * H) + torch.diag(torch.cat([torch.zeros(3), torch.full((6,), 1e-4), torch.zeros(6)]))
+    A = H.mT @ (w.unsqueeze(-1) * H) + torch.diag(torch.cat([torch.zeros(3), model.prior()[1][4:]]))
     whole = torch.linalg.inv(A).diagonal(dim1=-2, dim2=-1)[:, :3]
     t = at / 0.4
     ours = C.diagonal(dim1=-2, dim2=-1)[:, :3] * torch.stack([torch.ones(2), torch.ones(2), (t * (1 - t)) ** -2], -1)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .errors import InputError
     from .estimator import Settings, estimate, paper_settings
     from .fit import Fit
+    from .frame import BaseFrame, common_frame
     from .io import Dataset, Shapes, read_dataset, read_dataset_spec, read_robot, read_shapes, write_result, write_shapes
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
@@ -45,6 +46,7 @@ _HOMES = {
     "errors": ("InputError",),
     "estimator": ("Settings", "estimate", "paper_settings"),
     "fit": ("Fit",),
+    "frame": ("BaseFrame", "common_frame"),
     "io": (
         "Dataset",
         "Shapes",
@@ -75,6 +77,7 @@ _HOMES = {
 }
 __all__ = [
     "Actuated",
+    "BaseFrame",
     "Calibration",
     "Dataset",
     "DatasetSpec",
@@ -112,6 +115,7 @@ __all__ = [
     "bounds",
     "calibrate",
     "cold_start",
+    "common_frame",
     "diagnose",
     "draw",
     "draw_on",

@@ -40,6 +40,7 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument("--tension-std", type=float, default=None, help="std of the tensions' sensors (N); else exact")
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
+    parser.add_argument("--one-frame", action="store_true", help="with --registration: it is the same in all samples")
     parser.add_argument(
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
     )

@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from jsonargparse import Namespace
@@ -16,6 +17,8 @@ from .estimator import Settings
 from .estimator import estimate as run_estimate
 from .features import features
 from .fit import Evidence
+from .frame import STEPS as FRAME_STEPS
+from .frame import common_frame
 from .io import (
     RESULT_SUFFIXES,
     read_robot,
@@ -33,6 +36,7 @@ from .table import table
 from .warmstart import WarmStart, find_warm_start
 
 MAX_CONTACTS = 3
+Parts = list[tuple[Model, torch.Tensor]]
 ROBUST = 10.0  # degrees of freedom of Student's t: 1.5 % more error on clean markers, 7 % with a tenth of them 50 mm off
 
 
@@ -66,6 +70,8 @@ def estimate(options: Namespace) -> None:
     positive("--max-iterations", options.max_iterations)
     writable(options.out, RESULT_SUFFIXES)
     writable(options.plot, FIGURE_SUFFIXES)
+    if options.one_frame and not options.registration:
+        raise InputError("--one-frame says that all samples share what --registration estimates; give --registration as well")
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
@@ -78,12 +84,10 @@ def estimate(options: Namespace) -> None:
     candidates = _hypotheses(options, count, model)
     try:
         markers, noise, found = _with_noise(noise, candidates[-1].model, shapes.markers, settings)
-        result, evidence = _fitted(options, candidates, markers, noise, settings)
+        result, evidence, markers, fitted_by = _fitted(options, candidates, markers, noise, settings)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     result = result if found is None else found.judged(result)
-    choice = torch.zeros(len(shapes.samples), dtype=torch.int64) if evidence is None else evidence.choice
-    fitted_by = [(c.model, (choice == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
     diagnosis = diagnose(fitted_by, markers, noise, result, settings)
     print(table(result, shapes.samples, diagnosis, found))  # noqa: T201
     if options.out or options.plot:
@@ -105,14 +109,30 @@ def _with_noise(noise: float | None, richest: Model, markers: Markers, settings:
 
 def _fitted(
     options: Namespace, candidates: list[Hypothesis], markers: Markers, noise: float, settings: Settings
-) -> tuple[Estimate, Evidence | None]:
-    """The one hypothesis, or the best of several."""
+) -> tuple[Estimate, Evidence | None, Markers, Parts]:
+    """The fit by the only model there is, or by the one that each sample asks for; with the markers in the frame that was found for
+    all samples, if so wished, and every model with the samples that it was chosen for.
+    """
     start_of = _starts(options, [c.model for c in candidates], markers, noise)
-    if len(candidates) > 1:
-        return select(candidates, markers, noise, settings, start_of, _bar)
-    only = candidates[0]
-    with _bar(len(markers.positions), f"{only.contacts} contact{'s' * (only.contacts != 1)}") as bar:
-        return run_estimate(only.model, markers, noise, settings, start_of(only.model), bar.update), None
+
+    def fitted(candidates: list[Hypothesis], markers: Markers) -> tuple[Estimate, Evidence | None, Parts]:
+        if len(candidates) > 1:
+            result, evidence = select(candidates, markers, noise, settings, start_of, _bar)
+            return result, evidence, [(c.model, (evidence.choice == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
+        only = candidates[0]
+        with _bar(len(markers.positions), f"{only.contacts} contact{'s' * (only.contacts != 1)}") as bar:
+            result = run_estimate(only.model, markers, noise, settings, start_of(only.model), bar.update)
+        return result, None, [(only.model, torch.arange(len(markers.positions)))]
+
+    result, evidence, parts = fitted(candidates, markers)
+    if not options.one_frame:
+        return result, evidence, markers, parts
+    with _bar(FRAME_STEPS * len(markers.positions), "base frame") as bar:
+        frame = common_frame(parts, markers, noise, result, settings, bar.update)
+    markers = frame.corrected(markers)
+    plain = [replace(c, model=replace(c.model, registration=False)) for c in candidates]
+    result, evidence, parts = fitted(plain, markers)
+    return frame.widened(parts, markers, noise, result), evidence, markers, parts
 
 
 def _hypotheses(options: Namespace, count: int | None, model: Callable[[int, str, str], Model]) -> list[Hypothesis]:

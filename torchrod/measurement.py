@@ -29,6 +29,7 @@ TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
 TIP_EXACT = 10.0  # the covariance of the result takes the tip residual as this much stiffer
 TIP_UNKNOWNS = {"none": 0, "force": 3, "wrench": 6}
 TIP_STD = 10.0  # of the weak prior on the unknown tip force and moment about zero, in force and moment scales
+FRAME_SHIFT, FRAME_TURN = 0.05, 0.175  # of the length, and rad (10 degrees): standard deviations of the prior on a registration
 TURN_SCALE = 0.1  # rad, one unit of a registration angle; a unit of translation is this part of the rod's length
 
 
@@ -103,14 +104,17 @@ class Model:
         """One unit of alpha's entries in x: the rod's force and moment scales (N, N m), or 1."""
         return self._scale_of(x, self.robot.rod.force_scale, self.robot.rod.moment_scale)
 
+    def zeta_scale(self, x: Tensor) -> Float[Tensor, " 6"]:
+        """One unit of zeta's entries in x (m, rad): tenths of L and of a radian, or 1."""
+        return self._scale_of(x, TURN_SCALE * self.robot.rod.length, TURN_SCALE)
+
     def split(
         self, x: Float[Tensor, "... n"]
     ) -> tuple[Float[Tensor, "... g"], Float[Tensor, "... 6"] | None, Float[Tensor, "... 6"]]:
         """gamma, zeta [m, rad] (None without registration) and alpha [N, N m]."""
         cuts = [self.coordinates.size, self.load_size + self.tension_size, self.size - 6]
         gamma, _, zeta, alpha = x.tensor_split(cuts, -1)
-        rod = self.robot.rod
-        zeta = zeta * self._scale_of(x, TURN_SCALE * rod.length, TURN_SCALE) if self.registration else None
+        zeta = zeta * self.zeta_scale(x) if self.registration else None
         return gamma, zeta, alpha * self.alpha_scale(x)
 
     def tip_wrench(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 6"]:
@@ -233,9 +237,14 @@ class Model:
         return torch.cat([w[:, :-6], TIP_EXACT**2 * w[:, -6:]], -1)
 
     def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Mean and precision of every entry of x: the loads' own; weak on tip and zeta, 1 on theta, none on alpha."""
+        """Mean and precision of every entry of x: the loads' own; weak on tip, 1 on theta, none on alpha, which (17) holds.
+
+        zeta is zero within FRAME_SHIFT and FRAME_TURN: what a base frame is off by after it was once set up. A wider prior lets an
+        unlikely frame pass for a push near the base: the error of the magnitude in Study 1 is half as large again (docs/trust.md).
+        """
         mean, precision = self.coordinates.prior()
         tip = mean.new_full((TIP_UNKNOWNS[self.tip],), TIP_STD**-2)
-        zeta, alpha = mean.new_full((6 * self.registration,), 1e-4), mean.new_zeros(6)
-        held = torch.cat([tip, mean.new_ones(self.tension_size), zeta, alpha])
+        off = mean.new_tensor([FRAME_SHIFT * self.robot.rod.length] * 3 + [FRAME_TURN] * 3)
+        zeta = (self.zeta_scale(mean) / off) ** 2 if self.registration else mean[:0]
+        held = torch.cat([tip, mean.new_ones(self.tension_size), zeta, mean.new_zeros(6)])
         return torch.cat([mean, torch.zeros_like(held)]), torch.cat([precision, held])

@@ -1,0 +1,90 @@
+"""A base frame that all samples share: as good as a known one with many shapes, honest about it with few."""
+
+import json
+import math
+
+import roma
+import torch
+
+from tests.robots import T
+from tests.study import study1
+from torchrod import GaussianCoordinates, Markers, Model, Shapes, common_frame, estimate, write_shapes
+from torchrod.cli import main
+
+SHIFT = 5e-3 * T([0.6, 0.0, 0.8], dtype=torch.float64)
+TURN = math.radians(3) * T([0.8, -0.6, 0.0], dtype=torch.float64)
+ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"
+
+
+def shapes(count: int):
+    """Study 1 with 1 mm noise: as it is, and from a base frame that is off by 5 mm and 3 degrees."""
+    study, generator = study1(count), torch.Generator().manual_seed(2)
+    seen = study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator)
+    return study, Markers(study.s, seen), Markers(study.s, seen @ roma.rotvec_to_rotmat(TURN).T + SHIFT)
+
+
+def model_of(study, registration: bool) -> Model:
+    return Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale), registration)
+
+
+def test_many_shapes_tell_the_frame():
+    """20 shapes: errors within 1.3 of those with a perfect frame, where every shape by itself has several times as much."""
+    study, perfect, moved = shapes(20)
+    known, apart = model_of(study, False), model_of(study, True)
+    everyone = torch.arange(20)
+    each = estimate(apart, moved, 1e-3)
+    frame = common_frame([(apart, everyone)], moved, 1e-3, each)
+    assert (frame.zeta[:3] - SHIFT).norm() < 1e-3
+    assert (frame.zeta[3:] - TURN).norm() < math.radians(0.7)
+    corrected = frame.corrected(moved)
+    plain = estimate(known, corrected, 1e-3)
+    fit = frame.widened([(known, everyone)], corrected, 1e-3, plain)
+    best = estimate(known, perfect, 1e-3)
+    for what in ("location", "magnitude"):
+        truth = study.location if what == "location" else study.force.norm(dim=-1)
+        mean = [float((getattr(f, what)[:, 0] - truth).abs().mean()) for f in (best, fit, each)]
+        assert mean[1] < 1.3 * mean[0], what
+        assert mean[2] > 2 * mean[0], what
+    assert (fit.location_std > plain.location_std).all()
+    assert fit.registration is not None
+    assert torch.equal(fit.registration, frame.zeta.expand(20, 6))
+    assert torch.linalg.eigvalsh(frame.covariance).min() > 0
+
+
+def test_the_share_of_the_frame_is_that_of_a_joint_covariance():
+    """One shape by itself: common_frame and `widened` together are the registration of that shape, to first order."""
+    study, _, moved = shapes(1)
+    known, apart, first = model_of(study, False), model_of(study, True), torch.arange(1)
+    each = estimate(apart, moved, 1e-3)
+    frame = common_frame([(apart, first)], moved, 1e-3, each)
+    corrected = frame.corrected(moved)
+    fit = frame.widened([(known, first)], corrected, 1e-3, estimate(known, corrected, 1e-3))
+    assert each.registration is not None
+    assert torch.allclose(frame.zeta, each.registration[0], atol=2e-3)
+    assert torch.allclose(fit.location_std, each.location_std, rtol=0.15)
+    assert torch.allclose(fit.magnitude_std, each.magnitude_std, rtol=0.15)
+
+
+def test_the_command_line(tmp_path, capsys):
+    """One frame for 12 samples, one of them nonsense; with one contact and with auto."""
+    study, _, moved = shapes(12)
+    positions = moved.positions.clone()
+    positions[5] = positions[5].flip(0)
+    (tmp_path / "robot.toml").write_text(ROD)
+    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(study.s, positions), [str(b) for b in range(12)]))
+    files = [str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv")]
+    for count in ("1", "auto"):
+        out = str(tmp_path / "result.json")
+        assert main(["estimate", *files, "--contacts", count, "--registration", "--one-frame", "--out", out]) == 0
+        records = json.loads((tmp_path / "result.json").read_text())["results"]
+        shift = [record["registration"]["translation_m"] for record in records]
+        assert all(s == shift[0] for s in shift)
+        assert (T(shift[0]) - SHIFT).norm() < 1.5e-3
+        assert [record["accepted"] for record in records] == [b != 5 for b in range(12)]
+        error = [abs(record["loads"][0]["location_m"] - float(study.location[int(record["sample"])])) for record in records]
+        assert sum(error[:5] + error[6:]) / 11 < 0.012
+    figure = tmp_path / "figure.png"
+    assert main(["plot", *files, str(tmp_path / "result.json"), "--out", str(figure)]) == 0
+    capsys.readouterr()
+    assert main(["estimate", *files, "--one-frame"]) == 2
+    assert "give --registration as well" in capsys.readouterr().err
