@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from peers import Fit, Problem
 
-from torchrod import Estimate, Estimator, Markers, cold_start, ekf, estimate, fast, find_warm_start
+from torchrod import Estimate, Estimator, Markers, Settings, cold_start, ekf, estimate, fast, find_warm_start
 from torchrod.estimator import CHUNK
 from torchrod.prepared import Prepared
 
@@ -61,8 +61,11 @@ class TorchrodPeer:
         return prepared, fast.Sums.room(len(positions), self.model.size, len(self.s))
 
     def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:
-        """See `peers.Peer`; torchrod chooses its own cold start, which is x on this rod."""
-        return as_fit(self.fitted("cold", positions))
+        """See `peers.Peer`, for the comparison of answers: all steps fine, as the peers', so that the iterations are the same.
+
+        torchrod chooses its own cold start, which is x on this rod.
+        """
+        return as_fit(estimate(self.model, self.markers(positions), self.case.noise, Settings(coarse=False)))
 
     def fitted(self, start: str, positions: np.ndarray) -> Estimate:
         """Markers to loads with covariance, everything included, from a "cold" or a "warm" start."""
