@@ -15,8 +15,7 @@ SCRIPTS = sorted((ROOT / "scripts").rglob("*.py")) + sorted((ROOT / "training").
 # From the command line down to the Lie-group helpers: a module imports only from layers below its own.
 LAYERS = [
     {"cli"},
-    {"commands"},
-    {"calibrate_command", "estimate_command", "observability_command", "simulate_command"},
+    {"calibrate_command", "estimate_command", "observability_command", "plot_command", "simulate_command"},
     {"arguments", "table"},
     {"production", "observability_figure"},
     {"io", "plot", "selection"},

@@ -1,9 +1,12 @@
 """H = dh/dx by forward mode against central differences, gravity, helical tendons, registration and offsets included."""
 
+import roma
 import torch
 
 from tests.robots import T, busy_robot
 from torchrod import GaussianCoordinates, Markers, Model, PointCoordinates, forward_jacobian
+from torchrod.jacobian import pointwise_jacobian
+from torchrod.lie import exponential, logarithm, product
 
 
 def check(model: Model, markers: Markers, x: torch.Tensor) -> None:
@@ -30,3 +33,13 @@ def test_derivatives_are_exact_at_zero_load_zero_strain_and_zero_rotation():
     model = Model(robot, coordinates, registration=True)
     markers = Markers(T([0.1, 0.4]), torch.zeros(1, 2, 3), torch.zeros(2, 3), T([[0.0, 0.0]]))
     check(model, markers, model.join(coordinates.start().unsqueeze(0), torch.zeros(1, 6)))
+
+
+def test_rotation_vectors_are_romas_and_smooth_at_zero():
+    w = torch.cat([torch.randn(20, 3), 1e-3 * torch.randn(20, 3), 1e-9 * torch.randn(5, 3), torch.zeros(1, 3)])
+    q = exponential(w)
+    assert torch.allclose(q, roma.rotvec_to_unitquat(w), atol=1e-14)
+    assert torch.allclose(logarithm(q), roma.unitquat_to_rotvec(roma.rotvec_to_unitquat(w)), atol=1e-13)
+    assert torch.allclose(product(q[:20], q[20:40]), roma.quat_product(q[:20], q[20:40]), atol=1e-14)
+    _, J = pointwise_jacobian(lambda w: logarithm(exponential(w)), w[20:])
+    assert torch.allclose(J, torch.eye(3).expand_as(J), atol=1e-12)

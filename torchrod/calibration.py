@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 from torch import Tensor
 
 from . import ekf
@@ -58,7 +58,7 @@ class Calibration:
     @property
     def accepted(self) -> bool:
         """Whether the calibrated robot explains the markers: converged, and chi2 below its 99.9 % point."""
-        return self.status is Status.CONVERGED and self.chi2 <= float(chi2_distribution.ppf(ACCEPT, self.dof))
+        return self.status is Status.CONVERGED and self.chi2 <= float(chdtri(self.dof, 1 - ACCEPT))
 
     @property
     def rescaled(self) -> bool:

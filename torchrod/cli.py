@@ -1,5 +1,6 @@
 """The command line. Nothing heavy is imported until a command runs, so that --help answers at once."""
 
+import importlib
 import sys
 import warnings
 from typing import NoReturn
@@ -141,6 +142,9 @@ COMMANDS = {
 }
 
 
+HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
+
+
 def _parser() -> ArgumentParser:
     parser = _Parser(prog="torchrod", description="Forces from shape: the loads on a continuum robot from its measured markers.")
     commands = parser.add_subcommands(required=True)
@@ -150,9 +154,9 @@ def _parser() -> ArgumentParser:
 
 
 def _run(options: Namespace) -> None:
-    from . import commands
-
-    getattr(commands, options.subcommand.replace("-", "_"))(options[options.subcommand])
+    name = options.subcommand
+    home = importlib.import_module(f".{HOMES.get(name, name)}_command", __package__)
+    getattr(home, name.replace("-", "_"))(options[name])
 
 
 def main(arguments: list[str] | None = None) -> int:

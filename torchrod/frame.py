@@ -14,7 +14,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -41,11 +40,15 @@ class BaseFrame:
 
     def corrected(self, markers: Markers) -> Markers:
         """The markers in the rod's own frame."""
+        import roma
+
         back = roma.rotvec_to_rotmat(self.zeta[3:]).T
         return replace(markers, positions=matvec(back, markers.positions - self.zeta[:3]))
 
     def moved_by(self, dz: Float[Tensor, " 6"]) -> Float[Tensor, " 6"]:
         """zeta after an error dz that is left in the corrected frame."""
+        import roma
+
         R = roma.rotvec_to_rotmat(self.zeta[3:])
         return torch.cat([self.zeta[:3] + R @ dz[:3], roma.rotmat_to_rotvec(R @ roma.rotvec_to_rotmat(dz[3:]))])
 

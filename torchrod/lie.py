@@ -1,11 +1,11 @@
 """Rotations and 3-vectors: the bottom of the house.
 
 The rod's orientation is a unit quaternion q = (x, y, z, w), RoMa's order, so that everything RoMa offers (rotation vectors,
-matrices, interpolation) applies to it. RoMa does the conversions; this module adds only the pointwise algebra of the
-arc-length step, which must stay free of branches and of 0/0 at zero rotation so that forward-mode derivatives are exact there.
+matrices, interpolation) applies to it. This module has the pointwise algebra of the arc-length step, which must stay free of
+branches and of 0/0 at zero rotation so that derivatives are exact there. RoMa does the rest, and is imported where it is used: it
+brings in torch's tracer, which takes as long as torch itself.
 """
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,6 +14,7 @@ Vector = Float[Tensor, "... 3"]
 Matrix = Float[Tensor, "... 3 3"]
 Quaternion = Float[Tensor, "... 4"]
 Twist = Float[Tensor, "... 6"]
+SMALL = 1e-4  # of a squared sine: below it series to the third term are exact to round-off
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -64,6 +65,39 @@ def normalized(q: Quaternion) -> Quaternion:
     return q / (q * q).sum(-1, keepdim=True).sqrt()
 
 
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """a b: first b, then a."""
+    va, wa, vb, wb = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    return torch.cat([wa * vb + wb * va + cross(va, vb), wa * wb - (va * vb).sum(-1, keepdim=True)], -1)
+
+
+def exponential(w: Vector) -> Quaternion:
+    """The rotation by a rotation vector w (rad): [sin(|w| / 2) w / |w|, cos(|w| / 2)], by its series near zero."""
+    t = 0.25 * (w * w).sum(-1, keepdim=True)
+    small = t < SMALL
+    half = torch.where(small, 1.0, t).sqrt()
+    sinc = torch.where(small, 1 - t / 6 * (1 - t / 20 * (1 - t / 42)), torch.sin(half) / half)
+    cosine = torch.where(small, 1 - t / 2 * (1 - t / 12 * (1 - t / 30)), torch.cos(half))
+    return torch.cat([0.5 * sinc * w, cosine], -1)
+
+
+def logarithm(q: Quaternion) -> Vector:
+    """The rotation vector (rad) of a unit quaternion, no longer than pi: 2 atan2(|v|, w) v / |v|, by its series near zero."""
+    q = torch.where(q[..., 3:] < 0, -q, q)
+    v, w = q[..., :3], q[..., 3:]
+    t = (v * v).sum(-1, keepdim=True)
+    small = t < SMALL
+    n = torch.where(small, 1.0, t).sqrt()
+    x = t / (w * w).clamp(min=SMALL)
+    series = 2 / w.clamp(min=SMALL) * (1 - x / 3 * (1 - 3 * x / 5 * (1 - 5 * x / 7)))
+    return torch.where(small, series, 2 * torch.atan2(n, w) / n) * v
+
+
+def turned(w: Vector, q: Quaternion) -> Quaternion:
+    """exp(w) q, w (rad) in the base frame."""
+    return product(exponential(w), q.expand(*w.shape[:-1], 4))
+
+
 def identity_quaternion(shape: tuple[int, ...], like: Tensor) -> Quaternion:
     """Unit quaternions of no rotation, of shape (*shape, 4), with the dtype and device of `like`."""
     return like.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*shape, 4)
@@ -74,5 +108,7 @@ def move(zeta: Twist, p: Float[Tensor, "... P 3"]) -> Float[Tensor, "... P 3"]:
 
     The derivative at zeta = 0 is exact (RoMa's series). Source: the registration transform of the paper, section II.D.
     """
+    import roma
+
     R = roma.rotvec_to_rotmat(zeta[..., 3:])
     return matvec(R.unsqueeze(-3), p) + zeta[..., None, :3]

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.stats import t as student_distribution
+from scipy.special import stdtrit
 from torch import Tensor
 
 from .estimator import Settings, estimate
@@ -43,7 +43,7 @@ class Noise:
 
     def judged(self, fit: Estimate) -> Estimate:
         """The fit with spreads for a noise that was estimated, accepted where the residual is white (2)."""
-        factor = torch.from_numpy(student_distribution.ppf(0.975, self.freedom.clamp(min=1).numpy())) / Z95
+        factor = torch.from_numpy(stdtrit(self.freedom.clamp(min=1).numpy(), 0.975)) / Z95
 
         def wider(C: Tensor | None) -> Tensor | None:
             return None if C is None else C * factor.square().reshape(-1, *[1] * (C.ndim - 1))

@@ -15,7 +15,7 @@ from functools import cache
 import torch
 from jaxtyping import Bool, Float
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2
+from scipy.special import chdtri, chndtr
 from torch import Tensor
 
 from .coordinates import GaussianCoordinates
@@ -163,8 +163,8 @@ def load_bound(
 @cache
 def noncentrality() -> float:
     """lambda: a chi-square test with 2 degrees of freedom and FALSE_ALARM finds F^T J F = lambda with probability POWER; 15.44."""
-    threshold = float(chi2.ppf(1 - FALSE_ALARM, 2))
-    return float(brentq(lambda size: ncx2.sf(threshold, 2, size) - POWER, 1.0, 100.0))  # pyright: ignore[reportArgumentType]
+    threshold = float(chdtri(2, FALSE_ALARM))
+    return float(brentq(lambda size: 1 - chndtr(threshold, 2, size) - POWER, 1.0, 100.0))  # pyright: ignore[reportArgumentType]
 
 
 def seen_by(s: Float[Tensor, " P"], location: Float[Tensor, " B"], tension: Float[Tensor, " T"] | None) -> Markers:

@@ -7,14 +7,24 @@ not even that when no load keeps its direction in the base frame; this is the fo
 
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .grid import DEFAULT_STEPS, Grid, make_grid
 from .jacobian import pointwise_jacobian
-from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, matvec, normalized, rotate
+from .lie import (
+    Quaternion,
+    Vector,
+    cross,
+    identity_quaternion,
+    inverse3,
+    logarithm,
+    matvec,
+    normalized,
+    rotate,
+    turned,
+)
 from .loads import Load, LoadIntegrals, total
 from .march import march, march_linearized, states_at
 from .robot import Robot
@@ -163,8 +173,8 @@ class _TipProblem:
         first = torch.zeros(*self.grid.nodes.shape[:-1], 1, dtype=torch.int64)
         states, tangents = self.march(q_tip, dq_tip, fraction, first)
         if dq_tip.shape[-1] == 0:
-            return roma.unitquat_to_rotvec(states[:, 0, 3:7]), tangents[:, 0, :3]
-        r, dr = pointwise_jacobian(roma.unitquat_to_rotvec, states[:, 0, 3:7])
+            return logarithm(states[:, 0, 3:7]), tangents[:, 0, :3]
+        r, dr = pointwise_jacobian(logarithm, states[:, 0, 3:7])
         return r, dr @ tangents[:, 0, 3:7]
 
     def newton_step(self, q_tip: Float[Tensor, "B 4"], fraction: Float[Tensor, " B"]) -> tuple[Vector, Vector]:
@@ -172,11 +182,6 @@ class _TipProblem:
         _, dq = pointwise_jacobian(lambda w: turned(w, q_tip), torch.zeros_like(q_tip[:, :3]))
         r, J = self.base(q_tip, dq, fraction)
         return r, -matvec(inverse3(J), r)
-
-
-def turned(w: Vector, q: Quaternion) -> Quaternion:
-    """exp(w) q, w (rad) in the base frame."""
-    return roma.quat_product(roma.rotvec_to_unitquat(w), q.expand(*w.shape[:-1], 4))
 
 
 def _newton(

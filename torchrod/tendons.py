@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from .lie import Matrix, Vector, hat, inverse3, matvec
@@ -43,6 +42,8 @@ class Tendon:
         zero = s.new_zeros(*s.shape, 1)
         if len(self.routing) == 1:
             return torch.cat([torch.from_numpy(rows[0, 1:]).expand(*s.shape, 2), zero], -1), torch.cat([zero, zero, zero], -1)
+        from scipy.interpolate import CubicSpline  # a third of a second, for routings that need it
+
         spline = CubicSpline(rows[:, 0], rows[:, 1:])
         knots, c = torch.from_numpy(spline.x), torch.from_numpy(spline.c)
         piece = (torch.searchsorted(knots, s.detach().contiguous(), right=True) - 1).clamp(0, len(knots) - 2)

@@ -1,16 +1,10 @@
-"""What each command does, once its arguments are known."""
+"""torchrod plot."""
 
 from jsonargparse import Namespace
 
 from .arguments import FIGURE_SUFFIXES, writable
-from .calibrate_command import calibrate
 from .errors import InputError
-from .estimate_command import estimate
 from .io import read_fit, read_robot, read_shapes
-from .observability_command import observability
-from .simulate_command import simulate, simulate_dataset
-
-__all__ = ["calibrate", "estimate", "observability", "plot", "simulate", "simulate_dataset"]
 
 
 def plot(options: Namespace) -> None:
