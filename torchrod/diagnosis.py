@@ -29,6 +29,7 @@ Cycle = tuple[int, ...]
 MOST_EXCHANGES = 3
 LOWERED = 0.5  # an exchange must halve what it is tried for, and chi^2, to be told
 TRANSLATION, ROTATION = 0.1, 0.35  # of the length, and rad: a base frame that is farther off than that is another mistake
+SURE = 10.0  # BIC: by so much a base frame must do better before it speaks against a fit that is accepted
 ITERATIONS = 60
 CHUNK = 64  # samples at a time: the table of exchanges holds (markers)^3 numbers of each while it is made
 
@@ -207,7 +208,7 @@ def _explained(
     if more is not None and len(refused) and 3 * len(markers.s) >= more.free_size:
         fit = estimate(more, markers.take(refused), noise, settings)
         by_load[refused] = _bic(fit.accepted, fit.chi2, more, n[refused])
-    best = torch.minimum(by_frame, torch.minimum(by_load, own))
+    best = torch.minimum(by_frame, torch.minimum(by_load, own - SURE))
     framed = torch.isfinite(best) & (by_frame == best)
     return torch.where(framed.unsqueeze(-1), zeta, torch.nan), torch.isfinite(best) & ~framed & (by_load == best)
 

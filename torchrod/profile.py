@@ -2,7 +2,7 @@
 
 The band is that of draws of the posterior, pointwise. A narrow load whose place is uncertain has a density that is far from linear
 in it: the first-order band, +-1.96 sqrt(J C J^T) with J = df/dgamma, is nearly zero a few widths from the estimated place and
-holds the truth there in 60 to 85 % of cases, not 95 (docs/trust.md).
+holds the truth there in 66 to 84 % of cases, not 95 (docs/trust.md).
 """
 
 from collections.abc import Sequence
