@@ -95,5 +95,6 @@ def run(samples: int) -> list[str]:
 WHAT = """\
 An exchange is told where fitting the exchanged labels more than halves chi^2; the reported fit is always that of the labels as
 they are. A registration error is told where estimating one explains the markers (accepted) and has a lower BIC than one more
-contact; with `auto` also where it explains them with fewer contacts than were chosen and a BIC lower by 10, because a base frame that is off passes for
+contact; with `auto` also where it explains them with fewer contacts than were
+chosen and a BIC lower by 10, because a base frame that is off passes for
 contacts near the base.""".splitlines()
