@@ -37,7 +37,7 @@ from .warmstart import WarmStart, find_warm_start
 
 MAX_CONTACTS = 3
 Parts = list[tuple[Model, torch.Tensor]]
-ROBUST = 10.0  # degrees of freedom of Student's t: 1.5 % more error on clean markers, 7 % with a tenth of them 50 mm off
+ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 
 
 def _count(options: Namespace, robot: Robot) -> int | None:
