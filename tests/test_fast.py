@@ -28,7 +28,7 @@ from torchrod import (
 )
 
 needs_compiler = pytest.mark.skipif(
-    fast.library(wait=True) is None, reason="no C++ compiler on this machine: there is only the torch path"
+    fast.library(wait=True) is None, reason="no kernel here (no C++ compiler, or TORCHROD_FAST=0): there is only the torch path"
 )
 TENSION = T([[3.0, 2.0], [1.0, 4.0], [0.0, 7.0]], dtype=torch.float64)
 

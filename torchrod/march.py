@@ -113,8 +113,8 @@ def step_with_tangents(
 def _step() -> Callable[..., tuple[State, Float[Tensor, "n B 13"]]]:
     """step_with_tangents, compiled whole by torch.compile where TORCHROD_COMPILE names a backend (inductor).
 
-    That is the portable path, for a GPU or a machine without a C++ compiler of its own: half a minute for each new batch size,
-    robot and family of loads, kept in torch's own cache on disk, then about fourteen times as fast (docs/performance.md).
+    That is the path that needs no kernel of ours; on a CPU torch's own compiler wants a C++ compiler too. A minute or more for each
+    new batch size, robot and family of loads, kept in torch's cache on disk, then 14 times as fast or more (docs/performance.md).
     """
     backend = os.environ.get("TORCHROD_COMPILE", "")
     return torch.compile(step_with_tangents, fullgraph=True, dynamic=False, backend=backend) if backend else step_with_tangents

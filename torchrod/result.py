@@ -126,12 +126,14 @@ class Estimate:
 
     def _outcome(self, sample: int) -> str:
         status = Status(int(self.status[sample]))
-        if status is Status.CONVERGED and not self.accepted[sample]:
-            return (
-                f"Converged, but chi2 = {float(self.chi2[sample]):.3g} for {int(self.dof[sample])} degrees of freedom: the model "
-                "does not explain the markers; allow more contacts, state more noise, or check tensions, gravity and registration."
-            )
-        return status.message
+        if status is not Status.CONVERGED or self.accepted[sample]:
+            return status.message
+        chi2, dof = float(self.chi2[sample]), int(self.dof[sample])
+        reason = f"chi2 = {chi2:.3g} for {dof} degrees of freedom"
+        if chi2 < _limit(dof):
+            reason = "most markers were left aside, or neighbouring residuals are too much alike for noise"
+        remedy = "allow more contacts, state more noise, or check tensions, gravity and registration"
+        return f"Converged, but {reason}: the model does not explain the markers; {remedy}."
 
     def fit(self, sample: int, profile: Profile | None = None) -> Fit:
         """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""

@@ -11,8 +11,10 @@ from reproduction.study2 import force_error
 from torch import Tensor
 
 from torchrod import Estimate, Markers, Model, Settings, Start, Status, cold_start, ekf, estimate, find_warm_start
-from torchrod.estimator import CHUNK, linearize
+from torchrod.estimator import CHUNK, CHUNK_TORCH, linearize
+from torchrod.fast import Sums, available
 from torchrod.loads import Load
+from torchrod.prepared import Prepared
 from torchrod.starts import StartRule, better_start
 
 from .cases import Case, Part
@@ -58,7 +60,7 @@ def rules(part: Part) -> dict[str, Callable[[Tensor], StartRule]]:
 
 def chunks(count: int) -> list[Tensor]:
     """Indices by the estimator's own chunks: the oracle must know which samples it is asked for."""
-    return list(torch.arange(count).split(CHUNK))
+    return list(torch.arange(count).split(CHUNK if available() else CHUNK_TORCH))
 
 
 def fitted(part: Part, rule: Callable[[Tensor], StartRule]) -> Estimate:
@@ -164,17 +166,14 @@ def start_times(part: Part) -> dict[str, float]:
     warm, w = rules(part)["warm"](torch.arange(0)), model.weights(markers, noise)
     x = part.oracle[torch.arange(TIMED_BATCH) % len(part.oracle)]
     Sigma0, Q = Settings().initial_covariance(x), torch.ones(model.size, dtype=x.dtype)
-
-    def iteration() -> None:
-        at = linearize(model, x, markers, w)
-        inflated = ekf.inflation(w, 3 * len(markers.s), at.decrement)
-        A, g = ekf.information(at.H, at.r, ekf.adapted_weights(w, 3 * len(markers.s), inflated), x, *model.prior())
-        ekf.update(ekf.predict(Sigma0.expand_as(A), Q), A, g)
+    many, none = Sigma0.repeat(len(x), 1, 1), torch.zeros(len(x), dtype=torch.bool)
+    at = ekf.Iterate(x.clone(), many.clone(), x.clone(), torch.full_like(x[:, 0], torch.inf), none)
+    once = Prepared(model, markers, w).iteration(at, many, Q, ekf.Limits(), Sums.room(len(x), model.size, len(markers.s)))
 
     return {
         "start_s": best_of(lambda: better_start(model, markers, noise, warm(model, markers, noise), Sigma0)),
         "cold_s": best_of(lambda: cold_start(model, markers, noise)),
-        "iteration_s": best_of(iteration),
+        "iteration_s": best_of(lambda: once(torch.arange(len(x)))),
     }
 
 
