@@ -19,19 +19,19 @@ struct Loads {
 struct Bump {
     V once, once_mu, once_c, again, again_mu, again_c;
 };
-INLINE V bell(V x) {  // exp(-x^2), but never so small that the mathematical library takes its slow way
-    return each(smaller(x * x, splat(700.0)), [](double a) { return std::exp(-a); });
+INLINE V bell(V x) {  // exp(-x^2), but never so small that it is no longer a normal number
+    return exponential(-smaller(x * x, splat(700.0)));
 }
 struct BumpAt {
     V mu, c, r, x0, E0, X0;  // r = sqrt(c), x0 = -r mu, E0 = erf(x0), X0 = exp(-x0^2)
     BumpAt(V mu, V c) : mu(mu), c(c), r(root(c)), x0(-r * mu) {
-        E0 = each(x0, [](double a) { return std::erf(a); });
         X0 = bell(x0);
+        E0 = error_function(x0, X0);
     }
     Bump operator()(V s) const {
         const double half = 0.5 * std::sqrt(M_PI);
         const V x = r * (s - mu), area = half / r;
-        const V E = each(x, [](double a) { return std::erf(a); }), X = bell(x);
+        const V X = bell(x), E = error_function(x, X);
         Bump b;
         b.once = area * (E - E0);
         b.again = area / r * (x * E - x0 * E0 + (X - X0) * (0.5 / half) - (x - x0) * E0);
