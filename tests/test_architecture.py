@@ -24,7 +24,7 @@ LAYERS = [
     {"probe", "stream", "diagnosis", "noise", "frame"},
     {"estimator", "warmstart"},
     {"result", "starts", "features", "network"},
-    {"fit"},
+    {"fit", "equilibrium"},
     {"prepared", "profile", "geometry"},
     {"ekf", "measurement", "dataset", "actuation"},
     {"coordinates", "statics"},

@@ -10,17 +10,17 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import PaperCoordinates
-from .fast import Sums
+from .equilibrium import COARSE_STEPS, coarse
+from .fast import Sums, iterate_all
 from .measurement import Markers, Model
 from .prepared import Prepared, served
 from .result import Estimate, make_estimate
 from .rod import DTYPE
-from .starts import Start, StartRule, better_start, cold_start, equilibrium_wrench
+from .starts import Start, StartRule, better_start, cold_start, in_equilibrium
 from .status import Learned, Status
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
-COARSE_STEPS = 20  # along the rod, as long as the fit is far from the data: within 1e-6 m of the exact shape
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 
@@ -98,10 +98,51 @@ def _silent(_: int) -> None:
     """No progress bar."""
 
 
+@dataclass(frozen=True)
+class _Course:
+    """Iterations on the samples `live`, at most `most` each: those far from the data by the coarse model, the rest by the fine one.
+
+    state: the iterate, Sigma0, Q and the sums, which change in place. rough, fine: a model made ready, and when it has arrived.
+    """
+
+    state: tuple[ekf.Iterate, Float[Tensor, "B n n"], Float[Tensor, " n"], Sums]
+    rough: tuple[Prepared, ekf.Limits]
+    fine: tuple[Prepared, ekf.Limits]
+    live: Int[Tensor, " b"]
+    near: Bool[Tensor, " B"]
+    most: int
+
+    def at_once(self) -> tuple[Bool[Tensor, " B"], Int[Tensor, " B"]]:
+        """Which samples have converged, and their iterations: step_by_step in one call of the kernel."""
+        at, Sigma0, Q, sums = self.state
+        calls = [(p.compiled_iteration(at, Sigma0, Q, limits, sums), p.tables(at.x)) for p, limits in (self.rough, self.fine)]
+        return iterate_all(calls[0], calls[1], self.live, self.near, self.most)
+
+    def step_by_step(self) -> tuple[Bool[Tensor, " B"], Int[Tensor, " B"]]:
+        """The same: samples leave the batch when they have converged; a failed one never touches its neighbours."""
+        at, Sigma0, Q, sums = self.state
+        rough_once, once = (p.iteration(at, Sigma0, Q, limits, sums) for p, limits in (self.rough, self.fine))
+        near, live, B = self.near, self.live, len(self.near)
+        converged, iterations = torch.zeros(B, dtype=torch.bool), torch.zeros(B, dtype=torch.int64)
+        for iteration in range(self.most):
+            if not len(live):
+                break
+            iterations[live] += 1
+            far, close = live[~near[live]], live[near[live]]
+            if len(far):
+                near[far] = rough_once(far)
+                near[far] |= 2 * iteration >= self.most
+            if len(close):
+                done = once(close)
+                converged[close[done]] = True
+                live = torch.cat([far, close[~done]]).sort().values
+        return converged, iterations
+
+
 def _filter(
     model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
 ) -> Estimate:
-    """Iterate one chunk. Samples leave the batch when they have converged; a failed one never touches its neighbours."""
+    """Iterate one chunk."""
     prepared = Prepared(model, markers, model.weights(markers, noise), settings.robust)
     x = start.x.clone()
     Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
@@ -110,27 +151,15 @@ def _filter(
     at = ekf.Iterate(x, Sigma0.clone(), x.clone(), cap, torch.zeros(len(x), dtype=torch.bool))
     ok = usable(model, markers)
     status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
-    iterations, live = torch.zeros(len(x), dtype=torch.int64), ok.nonzero().squeeze(-1)
+    live = ok.nonzero().squeeze(-1)
     sums = Sums.room(len(x), model.size, len(markers.s))
     limits = ekf.Limits(step=settings.step_limit)
-    rough = replace(prepared, model=replace(model, steps=min(model.steps, COARSE_STEPS)))
-    fine = prepared.iteration(at, Sigma0, Q, limits, sums)
-    coarse = rough.iteration(at, Sigma0, Q, limits._replace(decrement=NEAR, hold=False), sums)
+    rough = replace(prepared, model=coarse(model)), limits._replace(decrement=NEAR, hold=False)
     near = torch.full((len(x),), not settings.coarse or model.steps <= COARSE_STEPS)
-    for iteration in range(settings.max_iterations):
-        if not len(live):
-            break
-        iterations[live] += 1
-        far, close = live[~near[live]], live[near[live]]
-        if len(far):
-            near[far] = coarse(far)
-            near[far] |= 2 * iteration >= settings.max_iterations
-        if len(close):
-            done = fine(close)
-            status[close[done]] = int(Status.CONVERGED)
-            progress(int(done.sum()))
-            live = torch.cat([far, close[~done]]).sort().values
-    progress(len(live) + int((~ok).sum()))
+    course = _Course((at, Sigma0, Q, sums), rough, (prepared, limits), live, near, settings.max_iterations)
+    converged, iterations = course.at_once() if prepared.at_once else course.step_by_step()
+    status[converged] = int(Status.CONVERGED)
+    progress(len(x))
     rest = (status != int(Status.CONVERGED)).nonzero().squeeze(-1)
     if len(rest):
         sums.put(rest, prepared.take(rest).sums(at.x[rest]))
@@ -173,7 +202,7 @@ class _Chunk:
                 break
             part = replace(self.take(index), settings=hasty)
             gamma = coordinates.rescaled(fit.x[index, : coordinates.size], factor)
-            x = self.model.join(gamma, equilibrium_wrench(self.model, coordinates.loads(gamma), part.markers))
+            x = in_equilibrium(self.model, gamma, part.markers)
             fit = fit.improved_by(part.filtered(Start(x, None, torch.zeros(len(x), dtype=torch.bool))), index)
         return fit
 

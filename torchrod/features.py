@@ -25,16 +25,17 @@
 Source: kriging, e.g. Rasmussen & Williams 2006, eq. (2.23); what to feed and to divide by: measured (docs/training.md).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .equilibrium import without_load
 from .measurement import Markers, Model
 from .robot import Robot
 from .rod import DTYPE
-from .statics import ROUGH_TOLERANCE, solve_shape
 
 GRID = 20  # points of the grid
 STATIONS = 4  # where the known loads are described
@@ -79,11 +80,9 @@ def _beam(s: Float[Tensor, " S"], t: Float[Tensor, " T"]) -> tuple[Float[Tensor,
     return far, (t - s).clamp(min=0)
 
 
-def smoothed(
-    s: Float[Tensor, " P"], y: Float[Tensor, "B P 3"], seen: Bool[Tensor, "B P"], sigma: float
-) -> tuple[Float[Tensor, "B G 3"], Float[Tensor, "B G 3"]]:
-    """(2): deflection and curvature on the grid, from arc lengths, displacements and noise over L. Curvature is that of a step's
-    beginning, so that the base, where it is largest, is among them.
+def kriging(s: Float[Tensor, " P"], seen: Bool[Tensor, "U P"], sigma: float) -> Float[Tensor, "U 2G P"]:
+    """(2): what takes displacements to deflection and curvature on the grid, for U patterns of markers seen; all over L. Curvature
+    is that of a step's beginning, so that the base, where it is largest, is among them.
     """
     t = (torch.arange(NODES, dtype=DTYPE) + 0.5) / NODES
     grid = torch.linspace(1 / GRID, 1, GRID, dtype=DTYPE)
@@ -91,8 +90,33 @@ def smoothed(
     q2 = LOAD_STD**2 / NODES
     variance = torch.where(seen, sigma**2, MISSING_VARIANCE)
     factor = torch.linalg.cholesky(q2 * at_markers @ at_markers.T + torch.diag_embed(variance))
-    weights = torch.cholesky_solve(torch.where(seen.unsqueeze(-1), y, 0.0), factor)
-    out = (q2 * torch.cat([at_grid, bend]) @ at_markers.T) @ weights
+    cross = q2 * at_markers @ torch.cat([at_grid, bend]).T
+    return torch.cholesky_solve(cross.expand(len(seen), -1, -1), factor).mT
+
+
+@lru_cache(maxsize=32)
+def _kriging_of_all(s: Float[Tensor, " P"], version: int, length: float, sigma: float) -> Float[Tensor, "1 2G P"]:
+    """Where every marker was seen, kept for the next shapes unless s has been changed since."""
+    return kriging(s / length, torch.ones(1, len(s), dtype=torch.bool), sigma)
+
+
+@lru_cache(maxsize=32)
+def _places(s: Float[Tensor, " P"], version: int, length: float) -> Float[Tensor, " Q"]:
+    """The markers, the stations and the grid (m), likewise."""
+    stations, grid = (torch.linspace(length / n, length, n, dtype=DTYPE) for n in (STATIONS, GRID))
+    return torch.cat([s, stations, grid])
+
+
+def smoothed(
+    s: Float[Tensor, " P"], y: Float[Tensor, "B P 3"], seen: Bool[Tensor, "B P"], length: float, noise: float
+) -> tuple[Float[Tensor, "B G 3"], Float[Tensor, "B G 3"]]:
+    """(2) from displacements over L; s, length and noise in m. Each pattern of markers seen is solved once."""
+    y = torch.where(seen.unsqueeze(-1), y, 0.0)
+    if bool(seen.all()):
+        out = _kriging_of_all(s, s._version, length, noise / length) @ y
+    else:
+        patterns, which = torch.unique(seen, dim=0, return_inverse=True)
+        out = kriging(s / length, patterns, noise / length)[which] @ y
     return out[:, :GRID], out[:, GRID:]
 
 
@@ -118,13 +142,12 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
     """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod."""
     L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
     stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
-    places = torch.cat([markers.s, stations, torch.linspace(L / GRID, L, GRID, dtype=DTYPE)])
-    alike = markers.tension is None and model.robot.gravity.ndim == 1  # then one forward solve serves all
-    rest = solve_shape(model.robot, (), markers.tension, places, 1 if alike else len(seen), model.steps, ROUGH_TOLERANCE)
+    places = _places(markers.s, markers.s._version, L)
+    rest = without_load(model, replace(markers, s=places, offsets=None))
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
-    p0 = torch.where(torch.isfinite(rest.p), rest.p, straight).expand(len(seen), -1, -1)
+    p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
     sigma = torch.tensor(noise / L, dtype=DTYPE)
-    y, k = smoothed(markers.s / L, (markers.positions - p0[:, :P]) / L, seen, noise / L)
+    y, k = smoothed(markers.s, (markers.positions - p0[:, :P]) / L, seen, L, noise)
     amp = k[..., :2].square().sum(-1).mean(-1).sqrt().clamp(min=AMP_LEAST)
     turn = _canonical(k[..., :2], amp)
 
@@ -139,8 +162,7 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
         moment = turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1)
         parts += [pull, moment, turned(weight), turned(p0[:, P : P + STATIONS] / L)]
     q_tip = _facing((p0[:, -1] + L * y[:, -1]) - (p0[:, -2] + L * y[:, -2]))
-    alpha = rest.base_wrench.nan_to_num(0.0).expand(len(seen), 6)
-    return Features(torch.cat(parts, -1), amp, turn, count, alpha, q_tip)
+    return Features(torch.cat(parts, -1), amp, turn, count, rest.wrench.nan_to_num(0.0), q_tip)
 
 
 def prior_log_c(model: Model) -> float:

@@ -13,6 +13,7 @@ Per load, from the features of torchrod.features, in the canonical frame:
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from . import fast
 from .errors import InputError
 
 SCHEMA = 1  # of the card
@@ -77,19 +79,41 @@ class Network(torch.nn.Module):
 
     def forward(self, x: Float[Tensor, "B i"], amp: Float[Tensor, " B"], log_c: Float[Tensor, " B"]) -> Prediction:
         """amp (B,) as in Features, log_c (B,) the prior mean of log(c L^2)."""
-        z = self.body(((x - self.mean) / self.std).clamp(-INPUT_LARGEST, INPUT_LARGEST))
-        o = self.head(z).unflatten(-1, (self.count, PER_LOAD))
-        eta = o[..., 2:3].clamp(-ETA_LARGEST, ETA_LARGEST)
-        unit = 0.5 * amp[:, None, None] / torch.sigmoid(eta) ** 1.5
-        gamma = torch.cat([unit * o[..., :2], eta, o[..., 3:] + log_c[:, None, None]], -1).flatten(1)
-        one = torch.ones_like(eta)
+        z = self.hidden(x)
+        gamma, unit = self._gamma(z, amp, log_c)
+        one = torch.ones_like(unit)
         D = torch.cat([unit, unit, one, one], -1).flatten(1).detach()
         n = gamma.shape[-1]
         rows, columns = torch.tril_indices(n, n)
-        U = o.new_zeros(len(x), n, n)
+        U = gamma.new_zeros(len(x), n, n)
         U[:, rows, columns] = self.spread(z.detach())
         diagonal = U.diagonal(dim1=-2, dim2=-1).clamp(-LOG_DIAGONAL, LOG_DIAGONAL).exp()
         return Prediction(gamma, D, U.tril(-1) + torch.diag_embed(diagonal))
+
+    def guess(self, x: Float[Tensor, "B i"], amp: Float[Tensor, " B"], log_c: Float[Tensor, " B"]) -> Float[Tensor, "B n"]:
+        """gamma alone."""
+        return self._gamma(self.hidden(x), amp, log_c)[0]
+
+    def hidden(self, x: Float[Tensor, "B i"]) -> Float[Tensor, "B width"]:
+        """The last hidden layer: by the compiled kernel where it serves and no derivative is wanted."""
+        plain = x.dtype == self.mean.dtype == torch.float64 and x.device.type == "cpu"
+        if plain and not self.head.weight.requires_grad and not x.requires_grad and fast.available():
+            return self._compiled(tuple(p._version for p in self.body.parameters()))(x)
+        return self.body(((x - self.mean) / self.std).clamp(-INPUT_LARGEST, INPUT_LARGEST))
+
+    @lru_cache(maxsize=8)  # noqa: B019 - a handful of networks, kept with their copies
+    def _compiled(self, versions: tuple[int, ...]) -> fast.Perceptron:
+        """A copy of the weights as they are now; versions: changed with them."""
+        return fast.Perceptron([m for m in self.body if isinstance(m, torch.nn.Linear)], self.mean, self.std, INPUT_LARGEST)
+
+    def _gamma(
+        self, z: Float[Tensor, "B width"], amp: Float[Tensor, " B"], log_c: Float[Tensor, " B"]
+    ) -> tuple[Float[Tensor, "B n"], Float[Tensor, "B k 1"]]:
+        """(1), and F's factor in it."""
+        o = self.head(z).unflatten(-1, (self.count, PER_LOAD))
+        eta = o[..., 2:3].clamp(-ETA_LARGEST, ETA_LARGEST)
+        unit = 0.5 * amp[:, None, None] / torch.sigmoid(eta) ** 1.5
+        return torch.cat([unit * o[..., :2], eta, o[..., 3:] + log_c[:, None, None]], -1).flatten(1), unit
 
 
 def turn_of_gamma(turn: Float[Tensor, "B 2 2"], count: int) -> Float[Tensor, "B n n"]:

@@ -222,6 +222,8 @@ class Prepared:
 
     def cost(self, x: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
         """The cost of (3) with the prior's, r^T W r + (x0 - x)^T P (x0 - x)."""
+        if self.compiled:
+            return fast.cost_now(x, *self._prior, self.tables(x).structure)
         r = self.residual(self.h(x))
         s, _ = ekf.student((self.w * r * r)[:, :-6].unflatten(-1, (-1, 3)).sum(-1), self.nu)
         mean, precision = self._prior
@@ -241,16 +243,24 @@ class Prepared:
         """As torchrod.ekf has them."""
         return ekf.Normal(sums.A, sums.g, sums.cost, (self.w[:, :-6] > 0).sum(-1))
 
+    @property
+    def at_once(self) -> bool:
+        """Whether the kernel can do all iterations in one call: not where its tables depend on where x has come to."""
+        return self.compiled and family_of(self.model) != "point"
+
+    def compiled_iteration(
+        self, at: ekf.Iterate, Sigma0: Float[Tensor, "B n n"], Q: Float[Tensor, " n"], limits: ekf.Limits, sums: fast.Sums
+    ) -> fast.Iteration:
+        """`iteration` as the kernel has it."""
+        mean, precision = self._prior
+        filtering = {"Sigma0": Sigma0, "mean": mean, "precision": precision, "Q": Q}
+        return fast.Iteration(vars(at), filtering, limits._asdict(), sums)
+
     def iteration(
         self, at: ekf.Iterate, Sigma0: Float[Tensor, "B n n"], Q: Float[Tensor, " n"], limits: ekf.Limits, sums: fast.Sums
     ) -> Callable[[Int[Tensor, " b"]], Bool[Tensor, " b"]]:
         """One iteration of the filter on some samples, in place; it returns which of them are done, whose sums are kept."""
-        if self.compiled:
-            mean, precision = self._prior
-            filtering = {"Sigma0": Sigma0, "mean": mean, "precision": precision, "Q": Q}
-            call = fast.Iteration(vars(at), filtering, limits._asdict(), sums)
-        else:
-            call = None
+        call = self.compiled_iteration(at, Sigma0, Q, limits, sums) if self.compiled else None
 
         def once(live: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
             if call is not None:

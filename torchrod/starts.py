@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .loads import Load
+from .equilibrium import at_rest, coarse, without_load
 from .measurement import Markers, Model
 from .prepared import Prepared
-from .statics import ROUGH_TOLERANCE, solve_shape
 
 
 @dataclass(frozen=True)
@@ -30,23 +29,19 @@ class Start:
 StartRule = Callable[[Model, Markers, float], Start]
 
 
-def equilibrium_wrench(
-    model: Model, loads: tuple[Load, ...], markers: Markers, q_tip: Float[Tensor, "B 4"] | None = None
-) -> Float[Tensor, "B 6"]:
-    """alpha (N, N m) of the robot in equilibrium under these loads; zero where there is none to be found.
+def in_equilibrium(
+    model: Model, gamma: Float[Tensor, "B g"], markers: Markers, q_tip: Float[Tensor, "B 4"] | None = None
+) -> Float[Tensor, "B n"]:
+    """x at the loads gamma, with the base wrench of the robot in equilibrium under them; of zero where there is none to be found.
 
-    q_tip: the orientation of the tip near which to look, where it is known: much sooner found (torchrod.solve_shape).
+    q_tip: the orientation of the tip near which to look, where it is known: sooner found.
     """
-    B, s = len(markers.positions), markers.s[-1:]
-    shape = solve_shape(model.robot, loads, markers.tension, s, B, model.steps, ROUGH_TOLERANCE, q_tip)
-    return shape.base_wrench.nan_to_num(0.0)
+    return model.join(gamma, at_rest(model, markers, gamma, q_tip).wrench.nan_to_num(0.0))
 
 
 def cold_start(model: Model, markers: Markers, noise: float) -> Start:
     """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
-    alike = markers.tension is None and model.robot.gravity.ndim == 1
-    alpha = equilibrium_wrench(model, (), markers.take(torch.arange(1)) if alike else markers)
-    x = cold_from(model, alpha.expand(len(markers.positions), 6))
+    x = cold_from(model, without_load(model, markers).wrench.nan_to_num(0.0))
     return Start(x, None, torch.zeros(len(x), dtype=torch.bool))
 
 
@@ -60,16 +55,16 @@ def better_start(
 ) -> tuple[Start, Bool[Tensor, " B"]]:
     """Per warm sample, the cheaper of its guess and a cold start, and which guesses were dropped, (B,).
 
-    Sigma0 is what a cold start goes with. Each costs one evaluation of h without its Jacobian. A guess that is not finite, or that
-    bends the rod out of all bounds, is dropped with the rest.
+    Sigma0 is what a cold start goes with. Each costs one evaluation of h without its Jacobian, on coarse steps. A guess that is not
+    finite, or that bends the rod out of all bounds, is dropped with the rest.
     """
     index = start.warm.nonzero().squeeze(-1)
     if not len(index):
         return start, start.warm
     cold = cold_start(model, markers.take(index), noise).x if start.cold is None else start.cold[index]
-    both = markers.take(index.repeat(2))
-    cost = Prepared(model, both, model.weights(both, noise)).cost(torch.cat([start.x[index], cold])).nan_to_num(torch.inf)
-    worse = ~(cost[: len(index)] < cost[len(index) :])
+    part = markers if len(index) == len(start.warm) else markers.take(index)
+    prepared = Prepared(coarse(model), part, model.weights(part, noise))
+    worse = ~(prepared.cost(start.x[index]).nan_to_num(torch.inf) < prepared.cost(cold).nan_to_num(torch.inf))
     dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
     x = start.x.clone()
     x[dropped] = cold[worse]

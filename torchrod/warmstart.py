@@ -13,13 +13,13 @@ from .coordinates import GaussianCoordinates
 from .errors import InputError
 from .features import Features, features, is_active, prior_log_c
 from .measurement import Markers, Model
-from .network import PER_LOAD, Network, Prediction, load_checkpoint, turn_of_gamma
+from .network import PER_LOAD, Network, load_checkpoint, turn_of_gamma
 from .rod import Rod
-from .starts import Start, cold_from, cold_start, equilibrium_wrench
+from .starts import Start, cold_from, cold_start, in_equilibrium
 
 SLACK = 1.001  # on a stated range: 0.1 mm on 0.4 m is 2.5e-4 but for round-off
 INFLATION = 10.0  # of the predicted covariance: on cases it has not seen a network errs more than it thinks
-SPREAD = (1.0, 1e4)  # least and largest eigenvalue of Sigma0
+SPREAD = (1.0, 1e4)  # what Sigma0 has at least in every direction, and at most in all
 PACKAGE = Path(__file__).resolve().parent
 FOLDERS = (PACKAGE.parent / "checkpoints", PACKAGE / "checkpoints")  # of a source tree, of an installed package
 
@@ -62,10 +62,6 @@ class WarmStart:
         inside = (read.amp >= low) & (read.amp <= high) & (read.seen >= fewest) & (read.seen <= most)
         return inside if markers.tension is None else inside & torch.isfinite(markers.tension).all(-1)
 
-    def predict(self, model: Model, read: Features) -> Prediction:
-        """In the canonical frame."""
-        return self.network(read.x, read.amp, torch.full_like(read.amp, prior_log_c(model)))
-
     def __call__(self, model: Model, markers: Markers, noise: float) -> Start:
         """gamma from the network, alpha from the equilibrium under it; cold where the sample lies outside of what was learned.
 
@@ -82,11 +78,12 @@ class WarmStart:
         if not len(index):
             return Start(cold, None, warm)
         part = read.take(index)
-        prediction, turn = self.predict(model, part), turn_of_gamma(part.turn, size // PER_LOAD)
-        gamma = (turn.mT @ prediction.gamma.unsqueeze(-1)).squeeze(-1)
-        alpha = equilibrium_wrench(model, model.coordinates.loads(gamma), markers.take(index), part.q_tip)
-        x = cold.index_copy(0, index, model.join(gamma, alpha))
-        if not self.predicted_spread:
+        turn, log_c = turn_of_gamma(part.turn, size // PER_LOAD), torch.full_like(part.amp, prior_log_c(model))
+        prediction = self.network(part.x, part.amp, log_c) if self.predicted_spread else None
+        gamma = self.network.guess(part.x, part.amp, log_c) if prediction is None else prediction.gamma
+        gamma = (turn.mT @ gamma.unsqueeze(-1)).squeeze(-1)
+        x = cold.index_copy(0, index, in_equilibrium(model, gamma, markers.take(index), part.q_tip))
+        if prediction is None:
             return Start(x, None, warm, cold)
         Sigma0 = torch.eye(model.size, dtype=x.dtype).repeat(len(x), 1, 1)
         Sigma0[index, :size, :size] = turn.mT @ bounded(prediction.covariance) @ turn
@@ -94,9 +91,11 @@ class WarmStart:
 
 
 def bounded(covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
-    """Times INFLATION, with its eigenvalues between SPREAD[0] and SPREAD[1]."""
-    values, vectors = torch.linalg.eigh(INFLATION * covariance)
-    return (vectors * values.clamp(*SPREAD).unsqueeze(-2)) @ vectors.mT
+    """Times INFLATION, plus SPREAD[0] in every direction, with a trace of no more than SPREAD[1]: it can be inverted."""
+    trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+    wide = (SPREAD[1] / trace).clamp(max=INFLATION)[:, None, None] * covariance
+    wide.diagonal(dim1=-2, dim2=-1).add_(SPREAD[0])
+    return wide
 
 
 RANGES = ("amp", "noise_over_length", "markers_seen", "shear_over_bending", "torsion_over_bending")

@@ -30,7 +30,7 @@ from torchrod import (
 from torchrod.estimator import CHUNK, linearize
 from torchrod.features import features, prior_log_c
 from torchrod.network import PER_LOAD, turn_of_gamma
-from torchrod.starts import equilibrium_wrench
+from torchrod.starts import in_equilibrium
 
 L, DIAMETER, E, G = 0.4, 0.0014, 207e9, 79e9  # of the rod; the features are dimensionless, so one rod stands for all
 LEAST_SEEN = 8
@@ -195,7 +195,7 @@ def answered(model: Model, markers: Markers, noise: float, gamma: Float[Tensor, 
     """x after so many iterations of the filter from a truth gamma. The start counts as cold: the answer is wanted as it is."""
 
     def at_truth(model: Model, markers: Markers, noise: float) -> Start:
-        x = model.join(gamma, equilibrium_wrench(model, model.coordinates.loads(gamma), markers))
+        x = in_equilibrium(model, gamma, markers)
         return Start(torch.where(x.isnan(), cold_start(model, markers, noise).x, x), None, torch.zeros(len(x), dtype=torch.bool))
 
     return estimate(model, markers, noise, Settings(max_iterations=iterations, restarts=()), at_truth).x

@@ -13,7 +13,7 @@ from reproduction.study2 import Study2
 from torch import Tensor
 
 from torchrod import GaussianCoordinates, Markers, Model, PointForces, Robot, solve_shape
-from torchrod.starts import equilibrium_wrench
+from torchrod.starts import in_equilibrium
 
 MM = 1e-3
 SEED = 41_000  # far from the seeds of training and of the studies
@@ -103,7 +103,7 @@ def contact_part(robot: Robot, markers: Markers, noise: float, force: Tensor, lo
     gamma = model.coordinates.start().unflatten(0, (*location.shape[1:], 4)).expand(*location.shape, 4).clone()
     gamma[..., :2], gamma[..., 2] = force / robot.rod.force_scale, eta
     gamma = gamma.flatten(1)
-    oracle = model.join(gamma, equilibrium_wrench(model, model.coordinates.loads(gamma), markers))
+    oracle = in_equilibrium(model, gamma, markers)
     return Part(model, markers, noise, (force, location), oracle)
 
 

@@ -1,11 +1,13 @@
 """The compiled kernel: built on first use (build), and what it computes: the march (marching) and the fit (fitting)."""
 
 from .build import available, library
+from .filtering import Iteration, iterate_all
 from .fitting import (
     FAMILIES,
     FitTables,
-    Iteration,
     Sums,
+    balance_now,
+    cost_now,
     measure,
     measure_now,
     measured,
@@ -14,6 +16,7 @@ from .fitting import (
     seconds,
 )
 from .marching import known, march_linearized, with_rows
+from .perceptron import Perceptron
 from .structures import SHARED_DIMENSIONS
 
 __all__ = [
@@ -21,8 +24,12 @@ __all__ = [
     "SHARED_DIMENSIONS",
     "FitTables",
     "Iteration",
+    "Perceptron",
     "Sums",
     "available",
+    "balance_now",
+    "cost_now",
+    "iterate_all",
     "known",
     "library",
     "march_linearized",

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .build import library
-from .structures import Filter, Fit, fill, pointer, threads
+from .structures import Fit, fill, pointer, threads
 from .structures import Sums as CSums
 
 FAMILIES = {"none": 0, "gaussian": 1, "paper": 2, "point": 3, "linear": 4}
@@ -81,7 +81,7 @@ def _structure(tensors: list[Tensor], counts: list[int], numbers: list[float]) -
     return fit
 
 
-def _run(function: str, samples: int, *arguments: object) -> None:
+def run(function: str, samples: int, *arguments: object) -> None:
     """Call the library, on as many threads as the samples are worth, and count the time."""
     lib = library(wait=True)
     assert lib is not None
@@ -106,7 +106,7 @@ def measure_now(x: Tensor, index: Tensor, slopes: bool, fit: Fit, P: int) -> tup
     H = x.new_empty(b, 3 * P + 6, n if slopes else 0)
     x, index = x.contiguous(), index.contiguous()
     address = _at(H) if slopes else ctypes.c_void_p(None)
-    _run("torchrod_measure", b, ctypes.byref(fit), _at(x), _at(index), ctypes.c_int64(b), _at(h), address, _at(line))
+    run("torchrod_measure", b, ctypes.byref(fit), _at(x), _at(index), ctypes.c_int64(b), _at(h), address, _at(line))
     return h, H, line
 
 
@@ -178,7 +178,7 @@ def normal_equations_now(x: Tensor, fit: Fit, P: int) -> tuple[Tensor, Tensor, T
     r, line = x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
     sums, x = CSums(), x.contiguous()
     fill(sums, {"A": A, "g": g, "cost": cost, "r": r, "line": line}, {})
-    _run("torchrod_normal", B, ctypes.byref(fit), _at(x), ctypes.c_int64(B), ctypes.byref(sums))
+    run("torchrod_normal", B, ctypes.byref(fit), _at(x), ctypes.c_int64(B), ctypes.byref(sums))
     return A, g, cost, r, line
 
 
@@ -194,6 +194,28 @@ def normal_equations(
 def _(x, tensors, counts, numbers):
     B, n, P = x.shape[0], x.shape[1], _outputs(counts)
     return x.new_empty(B, 2, n, n), x.new_empty(B, 2, n), x.new_empty(B, 2), x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
+
+
+def cost_now(x: Float[Tensor, "B n"], mean: Float[Tensor, " n"], precision: Float[Tensor, " n"], fit: Fit) -> Float[Tensor, " B"]:
+    """The cost at x, the prior's (mean and precision) included."""
+    x, mean, precision, cost = x.contiguous(), mean.contiguous(), precision.contiguous(), x.new_empty(len(x))
+    run("torchrod_cost", len(x), ctypes.byref(fit), _at(x), _at(mean), _at(precision), ctypes.c_int64(len(x)), _at(cost))
+    return cost
+
+
+def balance_now(
+    x: Float[Tensor, "B n"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float, fit: Fit, P: int
+) -> tuple[Float[Tensor, "B 6"], Float[Tensor, " B"], Float[Tensor, "B P 3"]]:
+    """The base wrench (N, N m) in equilibrium with the loads of x, how far the base is from its clamp (rad), the centre line (m).
+
+    torchrod.statics.solve_shape without its damping: what has not settled to the tolerance (rad) must be solved by that.
+    """
+    B, x = len(x), x.contiguous()
+    q_tip = None if q_tip is None else q_tip.contiguous()
+    wrench, missed, line = x.new_empty(B, 6), x.new_empty(B), x.new_empty(B, P + 1, 3)
+    start, numbers = ctypes.c_void_p(pointer(q_tip)), (ctypes.c_int64(increments), ctypes.c_int64(B), ctypes.c_double(tolerance))
+    run("torchrod_balance", B, ctypes.byref(fit), _at(x), start, *numbers, _at(wrench), _at(missed), _at(line))
+    return wrench, missed, line[:, :P]
 
 
 @dataclass(frozen=True)
@@ -216,23 +238,3 @@ class Sums:
         """Write the samples of an index, in place."""
         for name in ("A", "g", "cost", "r", "line"):
             getattr(self, name)[index] = getattr(other, name)
-
-
-class Iteration:
-    """Iterations of the filter on one chunk, in place: ekf.advance at the normal equations of x.
-
-    state: x, Sigma, before, cap, done of ekf.Iterate. filtering: Sigma0 (B, n, n), mean, precision and Q (n). limits: those of
-    ekf.Limits by name. sums: written for the samples that are done.
-    """
-
-    def __init__(self, state: dict[str, Tensor], filtering: dict[str, Tensor], limits: dict[str, float | int], sums: Sums):
-        self._held = (state, filtering, sums)  # the structures hold bare addresses
-        self._filter, self._sums = Filter(), CSums()
-        fill(self._filter, state | filtering, limits)
-        fill(self._sums, vars(sums), {})
-
-    def __call__(self, tables: FitTables, live: Int[Tensor, " b"]) -> None:
-        """One iteration of the samples `live`."""
-        b, live = len(live), live.contiguous()
-        pointers = [ctypes.byref(x) for x in (tables.structure, self._filter, self._sums)]
-        _run("torchrod_iterate", b, *pointers, _at(live), ctypes.c_int64(b))

@@ -3,7 +3,9 @@
 #include <thread>
 #include <functional>
 
+#include "balance.h"
 #include "filter.h"
+#include "mlp.h"
 
 namespace {
 
@@ -128,16 +130,116 @@ void torchrod_normal(const Fit* f, const double* x, int64_t count, const Sums* o
     });
 }
 
-// One iteration of the filter on the samples `index`, in place; the sums of those that are done.
+// One iteration of the filter for the samples in the lanes, in place; the sums of those that are done.
+static void iterate(const Fit& f, const Filter& filter, const Sums& out, const Lanes& lanes, Room& room, std::vector<V>& numbers) {
+    const int64_t n = f.size;
+    const Measured m = measure(f, lanes, [&](int64_t j) { return fetch({filter.x, n}, lanes, j); }, true, room);
+    numbers.resize(6 * n * n + 7 * n);
+    const Normal N = normal_equations(f, lanes, m, numbers.data());
+    advance(filter, lanes, n, N, numbers.data() + 2 * n * n + 2 * n);
+    for (int64_t l = 0; l < lanes.count; l++)
+        if (filter.done[lanes.sample[l]]) keep(f, lanes.sample[l], l, m, N, out);
+}
+
+// The same for the samples `index`.
 void torchrod_iterate(const Fit* f, const Filter* filter, const Sums* out, const int64_t* index, int64_t count, int64_t threads) {
-    const int64_t n = f->size;
-    in_groups(count, index, threads, [&](const Lanes& lanes, Room& room, std::vector<V>& numbers) {
-        const Measured m = measure(*f, lanes, [&](int64_t j) { return fetch({filter->x, n}, lanes, j); }, true, room);
-        numbers.resize(6 * n * n + 7 * n);
-        const Normal N = normal_equations(*f, lanes, m, numbers.data());
-        advance(*filter, lanes, n, N, numbers.data() + 2 * n * n + 2 * n);
+    in_groups(count, index, threads,
+              [&](const Lanes& lanes, Room& room, std::vector<V>& numbers) { iterate(*f, *filter, *out, lanes, room, numbers); });
+}
+
+// Iterations until every sample of `index` has converged or has had `most`: by the coarse model until it is near, then by the fine
+// one. estimator.py, _step_by_step. near (B): in and out; converged, iterations (B): out.
+struct Course {
+    const Fit *coarse, *fine;
+    const Filter *rough, *filter;
+    const Sums* out;
+    int64_t most;
+    uint8_t *near, *converged;
+    int64_t* iterations;
+};
+
+static void run(const Course& c, const int64_t* index, int64_t count) {
+    std::vector<int64_t> queue[2];  // far, near
+    Room room;
+    std::vector<V> numbers;
+    for (int64_t i = count - 1; i >= 0; i--) queue[c.near[index[i]] != 0].push_back(index[i]);
+    while (!queue[0].empty() || !queue[1].empty()) {
+        const bool fine = queue[0].empty() || queue[1].size() >= W;  // lanes are filled as long as there is what to fill them with
+        auto& from = queue[fine];
+        Lanes lanes;
+        lanes.count = from.size() < W ? from.size() : W;
+        for (int64_t l = 0; l < lanes.count; l++) lanes.sample[l] = from.back(), from.pop_back();
+        for (int64_t l = lanes.count; l < W; l++) lanes.sample[l] = lanes.sample[0];
+        const Filter& filter = fine ? *c.filter : *c.rough;
+        iterate(fine ? *c.fine : *c.coarse, filter, *c.out, lanes, room, numbers);
+        for (int64_t l = 0; l < lanes.count; l++) {
+            const int64_t b = lanes.sample[l], had = c.iterations[b]++;
+            if (fine && filter.done[b]) c.converged[b] = 1;
+            else if (had + 1 < c.most) {
+                if (!fine) c.near[b] = filter.done[b] || 2 * had >= c.most;
+                queue[c.near[b] != 0].push_back(b);
+            }
+        }
+    }
+}
+
+void torchrod_filter(const Course* c, const int64_t* index, int64_t count, int64_t threads) {
+    if (threads <= 1) return run(*c, index, count);
+    std::vector<std::thread> pool;
+    for (int64_t t = 1; t < threads; t++)
+        pool.emplace_back(run, std::cref(*c), index + count * t / threads, count * (t + 1) / threads - count * t / threads);
+    run(*c, index, count / threads);
+    for (auto& thread : pool) thread.join();
+}
+
+// The base wrench (b, 6) in equilibrium with the loads of x (b, n), how far it is from that (b), the centre line (b, P, 3) and the
+// base. q_tip (b, 4) or null.
+void torchrod_balance(const Fit* f, const double* x, const double* q_tip, int64_t increments, int64_t count, double tolerance,
+                      double* wrench, double* missed, double* line, int64_t threads) {
+    const int64_t n = f->size, numbers_of_line = 3 * f->known.outputs;
+    in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
+        V q[4];
+        for (int i = 0; q_tip && i < 4; i++) q[i] = fetch({q_tip, 4}, lanes, i);
+        const auto entry = [&](int64_t j) { return fetch({x, n}, lanes, j); };
+        const Balanced b = balanced(*f, lanes, entry, q_tip ? q : nullptr, increments, tolerance, room);
+        for (int64_t l = 0; l < lanes.count; l++) {
+            const int64_t to = lanes.sample[l];
+            for (int i = 0; i < PLAIN; i++) wrench[to * PLAIN + i] = b.wrench[i][l];
+            for (int64_t k = 0; k < numbers_of_line; k++) line[to * numbers_of_line + k] = b.line[k][l];
+            missed[to] = b.missed[l];
+        }
+    });
+}
+
+// A perceptron's output (b, last size) from its input (b, first size).
+void torchrod_perceptron(const Perceptron* p, const double* x, int64_t count, double* y, int64_t threads) {
+    const int64_t in = p->sizes[0], out = p->sizes[p->depth];
+    int64_t widest = 0;
+    for (int64_t k = 0; k <= p->depth; k++) widest = p->sizes[k] > widest ? p->sizes[k] : widest;
+    in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room&, std::vector<V>& numbers) {
+        numbers.resize(2 * widest);
+        for (int64_t i = 0; i < in; i++) numbers[i] = fetch({x, in}, lanes, i);
+        const V* found = perceptron(*p, numbers.data(), widest);
         for (int64_t l = 0; l < lanes.count; l++)
-            if (filter->done[lanes.sample[l]]) keep(*f, lanes.sample[l], l, m, N, *out);
+            for (int64_t o = 0; o < out; o++) y[lanes.sample[l] * out + o] = found[o][l];
+    });
+}
+
+// The cost of (3) at x (b, n) with the prior's: Prepared.cost.
+void torchrod_cost(const Fit* f, const double* x, const double* mean, const double* precision, int64_t count, double* cost,
+                   int64_t threads) {
+    const int64_t n = f->size, P = f->known.outputs - 1, Z = 3 * P + PLAIN;
+    in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
+        const auto entry = [&](int64_t j) { return fetch({x, n}, lanes, j); };
+        const Measured m = measure(*f, lanes, entry, false, room);
+        V sum = V{};
+        for (int64_t z = 0; z < Z; z += 3) {
+            V w[3], r[3];
+            const V square = residual(*f, lanes, m, z, w, r);
+            sum += z < 3 * P ? robust_cost(*f, square) : square;
+        }
+        for (int64_t i = 0; i < n; i++) sum += precision[i] * (mean[i] - entry(i)) * (mean[i] - entry(i));
+        for (int64_t l = 0; l < lanes.count; l++) cost[lanes.sample[l]] = sum[l];
     });
 }
 

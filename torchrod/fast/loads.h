@@ -49,8 +49,8 @@ INLINE V sigmoid(V x) {
 
 // One Gaussian's share of the table. x(j): entry j of gamma. coordinates/gaussian.py and coordinates/paper.py.
 template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t k, Gamma x, V* local) {
-    const int64_t first = k * l.per_load, row = (1 + l.size) * PARTS, points = 3 * g.known->steps;
-    const bool net = l.family == GAUSSIAN, placed = l.locations;
+    const int64_t first = k * l.per_load, row = (1 + g.load_tangents) * PARTS, points = 3 * g.known->steps;
+    const bool slopes = g.load_tangents, net = l.family == GAUSSIAN, placed = l.locations;
     const V L = splat(l.length), share = placed ? V{} : sigmoid(x(first + 2));
     const V mu = placed ? splat(l.locations[k]) : L * share, dmu = mu * (1.0 - share), last = x(first + l.per_load - 1);
     const V c = net ? each(last, [](double a) { return std::exp(a); }) / (L * L) : last, dc = net ? c : splat(1.0);
@@ -67,13 +67,15 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
         if (any(~(s == previous))) b = at(s);  // a step begins where the last one ended
         previous = s;
         const V q[2] = {b.once / S, b.again / S};
-        const V q_mu[2] = {(b.once_mu - q[0] * S_mu) / S * dmu, (b.again_mu - q[1] * S_mu) / S * dmu};
-        const V q_c[2] = {(b.once_c - q[0] * S_c) / S * dc, (b.again_c - q[1] * S_c) / S * dc};
         V* to = local + p * row;
         for (int axis = 0; axis < 2; axis++)
-            for (int o = 0; o < 2; o++) {  // G, then G2
+            for (int o = 0; o < 2; o++) to[axis + 3 * o] += F[axis] * q[o];  // G, then G2
+        if (!slopes) continue;
+        const V q_mu[2] = {(b.once_mu - q[0] * S_mu) / S * dmu, (b.again_mu - q[1] * S_mu) / S * dmu};
+        const V q_c[2] = {(b.once_c - q[0] * S_c) / S * dc, (b.again_c - q[1] * S_c) / S * dc};
+        for (int axis = 0; axis < 2; axis++)
+            for (int o = 0; o < 2; o++) {
                 const int part = axis + 3 * o;
-                to[part] += F[axis] * q[o];
                 to[(1 + first + axis) * PARTS + part] = unit * q[o];
                 if (!placed) to[(1 + first + 2) * PARTS + part] = F[axis] * q_mu[o];
                 to[(first + l.per_load) * PARTS + part] = F[axis] * q_c[o];
@@ -83,7 +85,7 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
 
 // One point force at an unknown place, which is a node and carries its neighbours' stages along. coordinates/point.py.
 template <class Gamma> void add_point(const Loads& l, const Group& g, int64_t k, Gamma x, V* local) {
-    const int64_t first = k * l.per_load, row = (1 + l.size) * PARTS, points = 3 * g.known->steps;
+    const int64_t first = k * l.per_load, row = (1 + g.load_tangents) * PARTS, points = 3 * g.known->steps;
     const V share = sigmoid(x(first + 2)), mu = l.length * share, dmu = mu * (1.0 - share);
     const V F[2] = {l.force_scale * x(first), l.force_scale * x(first + 1)};
     for (int64_t p = 0; p <= points; p++) {
@@ -93,6 +95,7 @@ template <class Gamma> void add_point(const Loads& l, const Group& g, int64_t k,
         V* to = local + p * row;
         for (int axis = 0; axis < 2; axis++) {
             to[axis] += F[axis] * on, to[3 + axis] += F[axis] * ramp;
+            if (!g.load_tangents) continue;
             to[(1 + first + axis) * PARTS + axis] = l.force_scale * on;
             to[(1 + first + axis) * PARTS + 3 + axis] = l.force_scale * ramp;
             for (int64_t j = 0; j < l.size; j++) {  // the ramp's foot moves with this load, its head with any load's node
@@ -119,9 +122,9 @@ template <class Gamma> void move_nodes(const Loads& l, const Group& g, Gamma x, 
     }
 }
 
-// The whole table, (3 S + 1, 1 + size, PARTS).
+// The whole table, (3 S + 1, 1 + load_tangents, PARTS): slopes for all entries of gamma, or none.
 template <class Gamma> void fill_local(const Loads& l, const Group& g, Gamma x, V* local) {
-    const int64_t row = (1 + l.size) * PARTS, rows = 3 * g.known->steps + 1;
+    const int64_t row = (1 + g.load_tangents) * PARTS, rows = 3 * g.known->steps + 1;
     for (int64_t i = 0; i < rows * row; i++) local[i] = V{};
     for (int64_t k = 0; k < l.count; k++) {
         if (l.family == GAUSSIAN || l.family == PAPER) add_gaussian(l, g, k, x, local);
@@ -132,7 +135,7 @@ template <class Gamma> void fill_local(const Loads& l, const Group& g, Gamma x, 
             for (int64_t j = 0; j < l.size; j++)
                 for (int part = 0; part < PARTS; part++) {
                     const V unit = splat(l.basis[(p * l.size + j) * PARTS + part]);
-                    local[p * row + (1 + j) * PARTS + part] = unit;
+                    if (g.load_tangents) local[p * row + (1 + j) * PARTS + part] = unit;
                     local[p * row + part] += x(j) * unit;
                 }
 }

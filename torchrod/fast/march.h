@@ -18,6 +18,7 @@ struct Group {
     const V* node_moves;  // (S + 1, load_tangents): how the nodes move; null where they do not
     Table weight;         // (3) N/m, the slope -dWn/ds where nodes move
     Table active;         // (S, 3, T), 1 where a tendon pulls; unless tensions are free there is none
+    double dead = 1;      // the part of Wn and Wm that is on
 
     const V* local_at(int64_t row) const { return local ? local + row * (1 + load_tangents) * PARTS : nullptr; }
     const V* local_slope(int64_t row, int64_t j) const {
@@ -32,8 +33,8 @@ inline void stage_of(const Group& g, int64_t row, Stage& s) {
     s.Wn_there = m.Wn.data, s.Wm_there = m.Wm.data;
     for (int c = 0; c < 3; c++) {
         s.Gm.c[c] = m.Gm.data ? fetch(m.Gm, g.lanes, 3 * row + c) : V{};
-        if (s.Wn_there) s.Wn.c[c] = fetch(m.Wn, g.lanes, 3 * row + c);
-        if (s.Wm_there) s.Wm.c[c] = fetch(m.Wm, g.lanes, 3 * row + c);
+        if (s.Wn_there) s.Wn.c[c] = g.dead * fetch(m.Wn, g.lanes, 3 * row + c);
+        if (s.Wm_there) s.Wm.c[c] = g.dead * fetch(m.Wm, g.lanes, 3 * row + c);
         s.u_star.c[c] = fetch(m.u_star, g.lanes, 3 * row + c);
     }
     for (int64_t x = 0; x < 18 * m.tendons; x++) s.L[x] = fetch(m.L, g.lanes, row * 18 * m.tendons + x);
@@ -124,6 +125,7 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
     const bool plain = !m.tendons && !m.Wn.data && !m.Wm.data;
     auto arrive = [&](int64_t node) {
         for (int64_t p = 0; p < m.outputs; p++) {
+            if (m.at.stride == 0 && m.at.data[p] != node) continue;
             const Mask here = reached(m.at, g.lanes, p, node);
             if (any(here)) sink(p, here);
         }

@@ -76,14 +76,14 @@ template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, bool sl
     const int64_t g = f.loads.size;
     room.tension.resize(f.tensions);
     for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(g + f.tip + t);
-    Group group{&m, lanes, slopes ? g + f.tensions + PLAIN : 0, g, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active};
-    if (f.loads.family == POINT) {
+    Group group{&m, lanes, slopes ? g + f.tensions + PLAIN : 0, slopes ? g : 0, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active};
+    if (f.loads.family == POINT && slopes) {
         room.moves.resize((m.steps + 1) * g);
         move_nodes(f.loads, group, x, room.moves.data());
         group.node_moves = room.moves.data();
     }
     if (f.loads.family != NONE) {
-        room.local.resize((3 * m.steps + 1) * (1 + g) * PARTS);
+        room.local.resize((3 * m.steps + 1) * (1 + group.load_tangents) * PARTS);
         fill_local(f.loads, group, x, room.local.data());
         group.local = room.local.data();
     }
@@ -168,9 +168,10 @@ template <class X> struct Show {
 template <class X> Measured measure(const Fit& f, const Lanes& lanes, X x, bool slopes, Room& room) {
     const Known& m = f.known;
     const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
-    room.rows.assign((3 * P + PLAIN) * (1 + n), V{});
+    const int64_t width = slopes ? 1 + n : 1;
+    room.rows.assign((3 * P + PLAIN) * width, V{});
     room.line.assign(3 * P, V{});
-    const Measured to{room.rows.data(), room.line.data(), 1 + n};
+    const Measured to{room.rows.data(), room.line.data(), width};
     const Group g = group_of(f, lanes, x, slopes, room);
     Motion motion;
     if (f.registration) {
@@ -216,30 +217,43 @@ INLINE void accumulate(const Measured& m, int64_t z, int64_t rows, const V* w, c
     }
 }
 
-// r = z - h, zero where a marker is missing, takes the place of h. With Student's t of `robust` degrees of freedom each marker's weight is multiplied by
+// r = z - h of three rows, zero where a marker is missing, and their weights. Returns r^T W r.
+INLINE V residual(const Fit& f, const Lanes& lanes, const Measured& m, int64_t z, V* w, V* r) {
+    const int64_t P = f.known.outputs - 1, Z = 3 * P + PLAIN;
+    V square = V{};
+    for (int k = 0; k < 3; k++) {
+        w[k] = fetch({f.w, Z}, lanes, z + k);
+        const V at = z < 3 * P ? fetch({f.positions, 3 * P}, lanes, z + k) : V{};
+        r[k] = select(w[k] > 0, at - m.h(z + k), V{});
+        square += w[k] * r[k] * r[k];
+    }
+    return square;
+}
+
+INLINE V robust_cost(const Fit& f, V square) {
+    if (!std::isfinite(f.robust)) return square;
+    return (f.robust + 3) * each(square / f.robust, [](double a) { return std::log1p(a); });
+}
+
+// r takes the place of h. With Student's t of `robust` degrees of freedom each marker's weight is multiplied by
 // (nu + 3) / (nu + s), s = r^T W r of that marker, and its cost is (nu + 3) log(1 + s / nu): ekf.py, student_weights.
 inline Normal normal_equations(const Fit& f, const Lanes& lanes, const Measured& m, V* room) {
     const int64_t n = f.size, P = f.known.outputs - 1, Z = 3 * P + PLAIN;
     Normal N{{room, room + n * n}, {room + 2 * n * n, room + 2 * n * n + n}, {V{}, V{}}, V{}};
     for (int64_t i = 0; i < 2 * n * n + 2 * n; i++) room[i] = V{};
     for (int64_t z = 0; z < Z; z += 3) {
-        V w[3], r[3], square = V{};
+        V w[3], r[3];
+        const V square = residual(f, lanes, m, z, w, r);
         const bool marker = z < 3 * P;
         for (int k = 0; k < 3; k++) {
-            w[k] = fetch({f.w, Z}, lanes, z + k);
-            const V at = marker ? fetch({f.positions, 3 * P}, lanes, z + k) : V{};
-            r[k] = select(w[k] > 0, at - m.h(z + k), V{});
             m.h(z + k) = r[k];
-            square += w[k] * r[k] * r[k];
             if (marker) N.seen += select(w[k] > 0, splat(1.0), V{});
         }
-        V cost = square;
         if (marker && std::isfinite(f.robust)) {
             const V factor = (f.robust + 3) / (f.robust + square);
             for (auto& x : w) x *= factor;
-            cost = (f.robust + 3) * each(square / f.robust, [](double a) { return std::log1p(a); });
         }
-        N.cost[!marker] += cost;
+        N.cost[!marker] += marker ? robust_cost(f, square) : square;
         accumulate(m, z, 3, w, r, n, N.A[!marker], N.g[!marker]);
     }
     return N;

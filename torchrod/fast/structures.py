@@ -61,6 +61,22 @@ class Filter(ctypes.Structure):
     ]
 
 
+class Perceptron(ctypes.Structure):
+    """struct Perceptron."""
+
+    _fields_ = [("depth", _I), *((n, _P) for n in ("sizes", "mean", "std")), ("largest", _D), ("weights", _P)]
+
+
+class Course(ctypes.Structure):
+    """struct Course."""
+
+    _fields_ = [
+        *((n, _P) for n in ("coarse", "fine", "rough", "filter", "out")),
+        ("most", _I),
+        *((n, _P) for n in ("near", "converged", "iterations")),
+    ]
+
+
 class March(ctypes.Structure):
     """struct March."""
 

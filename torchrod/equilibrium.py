@@ -1,0 +1,71 @@
+"""The robot in equilibrium under loads that are known, roughly and fast: what a start of the filter is made of."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from . import fast
+from .coordinates import GaussianCoordinates
+from .measurement import Markers, Model
+from .prepared import Prepared, family_of, served
+from .statics import LOAD_PER_INCREMENT, ROUGH_TOLERANCE, solve_shape
+
+COARSE_STEPS = 20  # along the rod, as long as the fit is far from the data: within 1e-6 m of the exact shape
+
+
+@dataclass(frozen=True)
+class Rest:
+    """B robots in equilibrium: wrench (B, 6) = [n(0) N, m(0) N m] and p (B, P, 3) m, base frame; NaN where there is none."""
+
+    wrench: Float[Tensor, "B 6"]
+    p: Float[Tensor, "B P 3"]
+
+
+def coarse(model: Model) -> Model:
+    """The model with no more than COARSE_STEPS steps."""
+    return model if model.steps <= COARSE_STEPS else replace(model, steps=COARSE_STEPS)
+
+
+def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None = None) -> Rest:
+    """The base wrench and the shape at markers.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
+
+    q_tip: the orientation of the tip near which to look, where it is known: sooner found. By the compiled kernel where it serves;
+    what does not settle there, and all else, by torchrod.solve_shape, which is the definition.
+    """
+    B, P = len(gamma), len(markers.s)
+    rough = replace(coarse(model), registration=False, tip="none", tension_std=None)
+    wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
+    settled = torch.zeros(B, dtype=torch.bool)
+    if family_of(rough) != "point" and model.robot.gravity.ndim == 1 and served(rough, markers.positions):
+        x = rough.join(gamma, wrench.new_zeros(B, 6))
+        tables = Prepared(rough, markers, gamma.new_zeros(B, 0)).tables(x)
+        wrench, missed, p = fast.balance_now(
+            x, q_tip, _increments(model) if q_tip is None else 1, ROUGH_TOLERANCE, tables.structure, tables.markers
+        )
+        settled = (missed <= ROUGH_TOLERANCE) & torch.isfinite(wrench).all(-1)
+    if bool(settled.all()):
+        return Rest(wrench, p)
+    index = (~settled).nonzero().squeeze(-1)
+    tension = None if markers.tension is None else markers.tension[index]
+    start = None if q_tip is None else q_tip[index]
+    loads = model.coordinates.loads(gamma[index]) if gamma.shape[-1] else ()
+    solved = solve_shape(model.robot, loads, tension, markers.s, len(index), rough.steps, ROUGH_TOLERANCE, start)
+    return Rest(wrench.index_copy(0, index, solved.base_wrench), p.index_copy(0, index, solved.p))
+
+
+def without_load(model: Model, markers: Markers) -> Rest:
+    """The robot under its tensions and its weight alone: one forward solve where the samples are alike before the load."""
+    bare = replace(model, coordinates=GaussianCoordinates(0, model.robot.rod.length, model.robot.rod.force_scale))
+    B, alike = len(markers.positions), markers.tension is None and model.robot.gravity.ndim == 1
+    part = markers.take(torch.arange(1)) if alike else markers
+    rest = at_rest(bare, part, markers.positions.new_zeros(len(part.positions), 0))
+    return Rest(rest.wrench.expand(B, 6), rest.p.expand(B, *rest.p.shape[1:]))
+
+
+def _increments(model: Model) -> int:
+    """In how many parts the weight is put on, so that each is no more than solve_shape's."""
+    rod, weight = model.robot.rod, model.robot.weight
+    return max(1, math.ceil(float(weight.norm()) * rod.length**3 / rod.bending_stiffness / LOAD_PER_INCREMENT))
