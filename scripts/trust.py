@@ -1,21 +1,25 @@
 """How far to trust an estimate: python scripts/trust.py [--samples N] [--out DIR] writes DIR/trust.md and DIR/trust.png.
 
 The paper's steel rod, 20 markers, 1 mm noise unless said otherwise: how often the 95 % intervals and the band of the load profile
-hold the truth; whether exchanged labels and a base frame that is off are told; what such a base frame costs.
+hold the truth; what missing markers, markers that are off and an unknown noise cost; whether exchanged labels and a base frame that
+is off are told; what such a base frame costs.
 """
 
 import argparse
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from trusting import coverage, frame, mistakes
+from trusting import coverage, frame, markers, mistakes, unknown_noise
 
 
 def main() -> None:
     """Write the page and its figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--samples", type=int, default=1000, help="runs per row of the coverage; the base frame takes a tenth, mistakes a 25th"
+        "--samples",
+        type=int,
+        default=1000,
+        help="runs per row; missing markers take four times as many, the noise a fifth, the base frame a tenth, mistakes a 25th",
     )
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
@@ -29,6 +33,8 @@ def main() -> None:
     left, right = figure.subplots(1, 2)
     for part in (
         coverage.run(options.samples, left),
+        markers.run(options.samples),
+        unknown_noise.run(max(options.samples // 5, 4)),
         mistakes.run(max(options.samples // 25, 4)),
         frame.run(max(options.samples // 10, 5), right),
     ):

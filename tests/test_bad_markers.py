@@ -26,6 +26,7 @@ WRONG = {
     "millimetres": ([[s, 1e3 * x, 1e3 * y, 1e3 * z] for s, x, y, z in GOOD], "are they in millimetres? give metres"),
     "centimetres": ([[s, 1e2 * x, 1e2 * y, 1e2 * z] for s, x, y, z in GOOD], "are they in centimetres? give metres"),
     "too small": ([[s, 1e-3 * x, 1e-3 * y, 1e-3 * z] for s, x, y, z in GOOD], "give positions in metres"),
+    "s too small": ([[1e-3 * s, x, y, z] for s, x, y, z in GOOD], "give the arc lengths s in metres"),
     "from the tip": ([[GOOD[LAST - i][0], *row[1:]] for i, row in enumerate(GOOD)][::-1], "count s from the base to the tip"),
     "other origin": ([[s, x + 0.3, y, z] for s, x, y, z in GOOD], "whose origin is where the rod leaves the base"),
 }

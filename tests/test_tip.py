@@ -116,3 +116,17 @@ def test_the_command_line_reports_the_tip(tmp_path, capsys):
     for found, true, std in zip(sample["tip"]["force_N"], (0.3, -0.1, 0.2), sample["tip"]["std"]["force_N"], strict=True):
         assert abs(found - true) < max(4 * std, 1e-3)
     assert main(["plot", robot, shape, out, "--out", figure]) == 0
+
+
+@pytest.mark.parametrize("suffix", ["json", "npz"])
+def test_a_tip_that_the_data_do_not_ask_for_is_not_drawn(tmp_path, capsys, suffix):
+    """--contacts auto with an unknown tip, of a push on the body: no tip in the table, and figures that can be drawn."""
+    robot, shape, out, figure = (str(tmp_path / n) for n in ("r.toml", "s.csv", f"o.{suffix}", "f.png"))
+    (tmp_path / "r.toml").write_text("[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n")
+    assert main(["simulate", robot, "--point", "0.2", "0.5", "0.3", "--noise", "1e-3", "--out", shape]) == 0
+    options = ["--contacts", "auto", "--unknown-tip", "force", "--out", out, "--plot", figure]
+    assert main(["estimate", robot, shape, *options]) == 0
+    said = capsys.readouterr().out
+    assert "tip, base frame" not in said
+    assert "nan" not in said
+    assert main(["plot", robot, shape, out, "--out", figure]) == 0

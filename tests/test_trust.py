@@ -1,7 +1,7 @@
 """The parts of scripts/trust.py run, and their figures say what the page says."""
 
 from matplotlib.figure import Figure
-from trusting import coverage, frame, mistakes
+from trusting import coverage, frame, markers, mistakes, unknown_noise
 
 from torchrod import Estimate
 
@@ -31,3 +31,33 @@ def test_one_frame_for_many_shapes():
         axes, {"perfect frame": [1, 1], "frame off, --registration": [3, 5], "off, --one-frame, 9 shapes": [1, 1]}, [1, 1]
     )
     assert len(axes.lines) == 3
+
+
+def test_missing_markers_cost_what_the_bounds_say():
+    """6 of 20: mean errors grow by no more than the bounds do, to within what 400 cases tell; all accepted."""
+    location, _, force, _, (held, _, accepted) = markers.missing(markers.MISSING[0], 400, 400)
+    for mean, low, high, bound in (location, force):
+        assert low < mean < high
+        assert low < bound
+        assert mean < 1.2 * bound
+    assert held > 0.92
+    assert accepted > 0.98
+
+
+def test_markers_that_are_off_lead_two_contacts_astray_no_more():
+    """Of 20 markers 2 are 50 mm off: within 1.5 of clean, mean and RMS; from the plain fit alone forces were 1.6 and 2.1."""
+    *ratios, (named, others, accepted, without) = markers.off(markers.OFF[-1], 600, 504)
+    for mean, *_ in ratios:
+        assert mean < 1.5
+    assert named > 0.99
+    assert others < 0.005
+    assert accepted > 0.98
+    assert without > 2
+
+
+def test_noise_and_count_unknown():
+    known, unknown, accepted, mean, least, most, far = unknown_noise.measured(unknown_noise.ROWS[4], 30, 1)
+    assert min(known, unknown, accepted) > 0.95
+    assert abs(mean - 1) < 0.1
+    assert 0.5 < least < most < 1.6
+    assert far < 0.1

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .jacobian import forward_jacobian
     from .loads import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads
     from .measurement import Markers, Model
-    from .noise import Noise, estimate_noise
+    from .noise import Noise, estimate_noise, estimate_noise_among
     from .observability import Observability, bounds, load_bound
     from .placement import Placement, place
     from .plot import draw, draw_on
@@ -60,7 +60,7 @@ _HOMES = {
     "jacobian": ("forward_jacobian",),
     "loads": ("FourierLoads", "GaussianLoads", "PointForces", "PointWrenches", "PolynomialLoads"),
     "measurement": ("Markers", "Model"),
-    "noise": ("Noise", "estimate_noise"),
+    "noise": ("Noise", "estimate_noise", "estimate_noise_among"),
     "observability": ("Observability", "bounds", "load_bound"),
     "placement": ("Placement", "place"),
     "plot": ("draw", "draw_on"),
@@ -121,6 +121,7 @@ __all__ = [
     "draw_on",
     "estimate",
     "estimate_noise",
+    "estimate_noise_among",
     "find_warm_start",
     "forward_jacobian",
     "load_bound",

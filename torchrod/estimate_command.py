@@ -26,11 +26,11 @@ from .io import (
     write_result,
 )
 from .measurement import Markers, Model
-from .noise import Noise, estimate_noise
+from .noise import Noise, estimate_noise_among
 from .profile import Profile, joined_profile
 from .result import Estimate
 from .robot import Robot
-from .selection import Hypothesis, select
+from .selection import Hypothesis, same_kind, select
 from .starts import StartRule, cold_start
 from .table import table
 from .warmstart import WarmStart, find_warm_start
@@ -83,7 +83,7 @@ def estimate(options: Namespace) -> None:
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     candidates = _hypotheses(options, count, model)
     try:
-        markers, noise, found = _with_noise(noise, candidates[-1].model, shapes.markers, settings)
+        markers, noise, found = _with_noise(noise, [c.model for c in candidates], shapes.markers, settings)
         result, evidence, markers, fitted_by = _fitted(options, candidates, markers, noise, settings)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
@@ -98,11 +98,13 @@ def estimate(options: Namespace) -> None:
             _draw(options.plot, robot, shapes.markers, result, shapes.samples, profile)
 
 
-def _with_noise(noise: float | None, richest: Model, markers: Markers, settings: Settings) -> tuple[Markers, float, Noise | None]:
+def _with_noise(
+    noise: float | None, models: list[Model], markers: Markers, settings: Settings
+) -> tuple[Markers, float, Noise | None]:
     """The markers, their noise (m) or, where each sample has its own, the middle one, and what was estimated."""
     if noise is not None:
         return markers, noise, None
-    found, known = estimate_noise(richest, markers, settings)
+    found, known = estimate_noise_among([m for m in models if same_kind(m, models[-1])], markers, settings)
     assert known.sigma is not None
     return known, float(known.sigma.median()), found
 

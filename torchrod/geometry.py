@@ -36,6 +36,8 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
     ratio = spans / along if along > 0 else size / length
     if ratio > FAR and size > FAR * length:
         return f"Positions reach {size:.3g} m on a rod of {length:g} m: {unit_hint(ratio)}."
+    if along > 0 and float((z.diff(dim=0).norm(dim=-1) / s.diff()).median()) > min(UNITS) / FAR:
+        return f"Markers {spans:.3g} m apart in space lie {along:.2g} m apart along the rod: give the arc lengths s in metres."
     if along > 0 and ratio < SMALL and spans + slack < along:
         return (
             f"Markers {along:.3g} m apart along the rod lie {spans:.2g} m apart in space: "

@@ -14,7 +14,8 @@ model explains the markers is judged by whether neighbouring residuals are alike
 is normal with standard deviation 1 / sqrt(3 (P - 1)) or less; loads missing in the model leave a smooth residual, rho near 1.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -93,6 +94,30 @@ def estimate_noise(
     known = nu > 0
     noise = Noise(sigma.where(known, torch.nan), (sigma / (2 * nu.clamp(min=1)).sqrt()).where(known, torch.nan), nu)
     return noise, replace(markers, sigma=sigma)
+
+
+def estimate_noise_among(
+    models: Sequence[Model], markers: Markers, settings: Settings | None = None, start: StartRule = cold_start
+) -> tuple[Noise, Markers]:
+    """The same where nobody knows the number of loads either: models of the same kind, each with more loads than the one before.
+
+    The richest that a sample has markers for tells its noise. It contains the others, so that its residual is the least of all;
+    where a poorer one leaves less, the fit of the richest has not settled, and the poorer one tells it. Without that a tenth of the
+    samples without a load, and 3 % of those with one, get a noise up to 14 times too large when it is 0.2 mm. A model without a
+    load never stands in for one that has too few markers: it would take a load for noise.
+    """
+    fitting = [model for model in models if 3 * len(markers.s) >= model.free_size] or [models[0]]
+    noise, known = estimate_noise(fitting[-1], markers, settings, start)
+    for model in reversed(fitting[:-1]):
+        other, by_other = estimate_noise(model, markers, settings, start)
+        less = other.sigma.square() * other.freedom < noise.sigma.square() * noise.freedom
+        instead = torch.isnan(noise.sigma) & torch.isfinite(other.sigma) & (model.load_size > 0)
+        swap = less | instead
+        noise = Noise(*(torch.where(swap, theirs, mine) for mine, theirs in zip(astuple(noise), astuple(other), strict=True)))
+        assert known.sigma is not None
+        assert by_other.sigma is not None
+        known = replace(known, sigma=torch.where(swap, by_other.sigma, known.sigma))
+    return noise, known
 
 
 def _onward(fit: Estimate) -> StartRule:

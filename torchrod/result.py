@@ -139,7 +139,7 @@ class Estimate:
         """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""
         zeta = None if self.registration is None else self.registration[sample]
         there = torch.isfinite(self.location[sample])
-        tip = None if self.tip is None else self.tip[sample, :3]
+        tip = None if self.tip is None or bool(self.tip[sample].isnan().all()) else self.tip[sample, :3]
         loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
         interval, along = self.location_interval[sample][there], None if profile is None else profile.of(sample)
         return Fit(*loads, self.base_wrench[sample], zeta, tip, interval, along)

@@ -158,7 +158,7 @@ def _needed(
 ) -> tuple[Int[Tensor, " b"], StartRule]:
     """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any."""
     everyone = torch.arange(len(markers.positions))
-    before = [h for h in hypotheses if h.contacts == hypothesis.contacts - 1 and _same_kind(h.model, hypothesis.model)]
+    before = [h for h in hypotheses if h.contacts == hypothesis.contacts - 1 and same_kind(h.model, hypothesis.model)]
     if not before:
         return everyone, rule
     if before[0].name not in fits:
@@ -175,7 +175,7 @@ def _needed(
     return index[rows], _from(begin) if hypothesis.contacts > 1 else rule
 
 
-def _same_kind(a: Model, b: Model) -> bool:
+def same_kind(a: Model, b: Model) -> bool:
     """Whether two models differ in the number of loads only; a model without loads has no width prior to differ in."""
     alike = getattr(a.coordinates, "prior_name", "") == getattr(b.coordinates, "prior_name", "") or not a.coordinates.size
     return a.tip == b.tip and alike

@@ -27,7 +27,7 @@ def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noi
             place = f"{float(result.location[b, k]) * 1e3:.1f} +- {float(result.location_std[b, k]) * 1e3:.1f}"
             fx, fy = result.force[b, k].tolist()
             lines.append(f"{head}{k + 1:>4}{force:>20}{fx:>10.4f}{fy:>10.4f}{place:>20}{rms:>10.3f}")
-        if result.tip is not None and result.tip_covariance is not None:
+        if result.tip is not None and result.tip_covariance is not None and not bool(result.tip[b].isnan().all()):
             std = result.tip_covariance[b].diagonal().sqrt().tolist()
             both = [f"{v:.4f} +- {s:.4f}" for v, s in zip(result.tip[b].tolist(), std, strict=True) if s > 0 or math.isnan(s)]
             lines.append(f"{'':>28} tip, base frame: force (N) {', '.join(both[:3])}" + _moment(both[3:]))
@@ -47,7 +47,9 @@ def _further(result: Estimate, b: int, noise: Noise | None) -> list[str]:
     if result.tension is not None and result.tension_std is not None:
         pairs = zip(result.tension[b].tolist(), result.tension_std[b].tolist(), strict=True)
         said.append("tensions (N) " + ", ".join(f"{v:.3f} +- {std:.3f}" for v, std in pairs))
-    if noise is not None:
+    if noise is not None and math.isnan(float(noise.sigma[b])):
+        said.append("noise not known: too few markers to tell it")
+    elif noise is not None:
         said.append(f"noise (mm) {1e3 * float(noise.sigma[b]):.3f} +- {1e3 * float(noise.std[b]):.3f}")
     if bool(result.outlier[b].any()):
         names = ", ".join(str(i + 1) for i in result.outlier[b].nonzero().flatten().tolist())

@@ -62,13 +62,17 @@ class Touched:
     positions: Tensor
     base_wrench: Tensor
 
+    def markers(self, noise: Tensor) -> Markers:
+        """With this noise (B, P, 3) m."""
+        return Markers(self.s, self.positions + noise)
 
-def touched(count: int, samples: int, g: torch.Generator, markers: int = 20) -> Touched:
+
+def touched(count: int, samples: int, g: torch.Generator, markers: int = 20, size: tuple[float, float] = (0.5, 1.0)) -> Touched:
     """Shapes under random point forces."""
     s = torch.linspace(L / markers, L, markers, dtype=torch.float64)
-    force, place = pushes(count, samples, g)
-    load = PointForces(torch.nn.functional.pad(force, (0, 1)), place)
-    shape = solve_shape(ROBOT, (load,), None, s, samples, 80)
+    force, place = pushes(count, samples, g, size)
+    loads = (PointForces(torch.nn.functional.pad(force, (0, 1)), place),) if count else ()
+    shape = solve_shape(ROBOT, loads, None, s, samples, 80)
     return Touched(force, place, s, shape.p, shape.base_wrench)
 
 

@@ -42,10 +42,10 @@ ROWS = (
 )
 
 
-class _Quiet:
+class Quiet:
     """No progress bar inside a row."""
 
-    def __enter__(self) -> "_Quiet":
+    def __enter__(self) -> "Quiet":
         return self
 
     def __exit__(self, *_: object) -> None: ...
@@ -68,7 +68,7 @@ def measured(row: Row, samples: int, seed: int) -> Sequence[object]:
         fit, parts = estimate(one, markers, row.stated), [(one, torch.arange(samples))]
     else:
         counts = [Hypothesis(str(k), k, model(k)) for k in range(4)]
-        fit, evidence = select(counts, markers, row.stated, Settings(), lambda _: cold_start, lambda *_: _Quiet())
+        fit, evidence = select(counts, markers, row.stated, Settings(), lambda _: cold_start, lambda *_: Quiet())
         parts = [(h.model, (evidence.choice == i).nonzero().squeeze(-1)) for i, h in enumerate(counts)]
     told = diagnose(parts, markers, row.stated, fit)
     right = sum(bool(b) and a == b for a, b in zip(told.exchanged, pairs, strict=True))

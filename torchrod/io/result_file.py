@@ -161,13 +161,18 @@ def _index(path: Path, names: list[str], sample: str) -> int:
     return names.index(sample)
 
 
+def _there(values: list[float | None]) -> list[float | None] | None:
+    """Nothing where every number is unknown: a tip that the data did not ask for."""
+    return None if all(v is None or math.isnan(v) for v in values) else values
+
+
 def _arrays_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
     """What a figure needs of a RESULT.npz: force, location, width, base wrench, registration, tip force, intervals; the profile."""
     with np.load(path, allow_pickle=False) as file:
         b = _index(path, [str(n) for n in file["sample"]], sample)
         values: list[object] = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
         values.append(file["registration"][b] if "registration" in file else None)
-        values.append(file["tip"][b][:3] if "tip" in file else None)
+        values.append(_there(file["tip"][b][:3].tolist()) if "tip" in file else None)
         values.append(file["location_interval"][b] if "location_interval" in file else None)
         if "profile_f" not in file:
             return values, None
@@ -183,7 +188,7 @@ def _record_of(path: Path, sample: str) -> tuple[list[object], list[object] | No
     values.append([*wrench["force_N"], *wrench["moment_Nm"]])
     twist = record.get("registration")
     values.append(None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]])
-    values.append(record["tip"]["force_N"] if "tip" in record else None)
+    values.append(_there(record["tip"]["force_N"]) if "tip" in record else None)
     values.append([load["interval_95"]["location_m"] for load in loads])
     profile = record.get("profile")
     if profile is None:
