@@ -207,12 +207,12 @@ class _Chunk:
         """From no load."""
         return self.filtered(cold_start(self.model, self.markers, self.noise))
 
-    def restarted(self, fit: Estimate) -> Estimate:
-        """The fit, and where it is not accepted again from other magnitudes."""
+    def restarted(self, fit: Estimate, wanted: Bool[Tensor, " B"] | bool = True) -> Estimate:
+        """The fit, and where it is not accepted (and a restart wanted) again from other magnitudes."""
         hasty = replace(self.settings, max_iterations=min(self.settings.max_iterations, RESTART_ITERATIONS))
         coordinates = self.model.coordinates
         for factor in self.settings.restarts if coordinates.size else ():
-            index = (~fit.accepted & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
+            index = (~fit.accepted & torch.isfinite(fit.x).all(-1) & wanted).nonzero().squeeze(-1)
             if not len(index):
                 break
             part = replace(self.take(index), settings=hasty)
@@ -235,7 +235,7 @@ def _fitted(chunk: _Chunk, start: Start, progress: Callable[[int], object]) -> E
     if len(index):
         again = chunk.take(index)
         fit = fit.improved_by(again.restarted(again.cold()), index)
-    return chunk.restarted(fit)
+    return chunk.restarted(fit, ~failed)
 
 
 def estimate(
