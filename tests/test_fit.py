@@ -101,6 +101,8 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     for name in ("A", "g", "cost"):
         assert close(getattr(sums, name), getattr(expected, name)), name
     assert close(sums.r, prepared.residual(h))
+    mean, precision = model.prior()
+    assert close(prepared.cost(x), expected.cost.sum(-1) + (precision * (mean - x) ** 2).sum(-1))
 
 
 @pytest.mark.parametrize("hold", [True, False])
@@ -197,6 +199,29 @@ def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     assert close(compiled.force, plain.force, 1e-8)
     assert close(compiled.location, plain.location, 1e-8)
     assert close(compiled.magnitude_std, plain.magnitude_std, 1e-5)  # round-off, times the condition of A
+
+
+@pytest.mark.parametrize("most", [3, 5, 100])
+def test_all_iterations_at_once_are_those_one_by_one(most, monkeypatch):
+    """More samples than lanes, that need from 5 to 20 iterations, one of which has no marker."""
+    robot, s = busy_robot(), torch.linspace(0.05, 0.4, 8)
+    generator = torch.Generator().manual_seed(5)
+    force = torch.cat([1.5 * torch.randn(29, 1, 2, generator=generator), torch.zeros(29, 1, 1)], -1)
+    at, tension = 0.08 + 0.3 * torch.rand(29, 1, generator=generator), TENSION[torch.arange(29) % 3]
+    p = solve_shape(robot, (PointForces(force, at),), tension, s, 29).p
+    p[7] = torch.nan
+    model, markers = Model(robot, GaussianCoordinates(1, 0.4, 1.0)), Markers(s, p, None, tension)
+    settings = Settings(max_iterations=most, restarts=())
+    at_once = fits(model, markers, settings)
+    monkeypatch.setattr(Prepared, "at_once", False)
+    one_by_one = fits(model, markers, settings)
+    assert torch.equal(at_once.status, one_by_one.status)
+    assert torch.equal(at_once.iterations, one_by_one.iterations)
+    assert (at_once.iterations.max() == most) == (most < 100)
+    for name in ("x", "covariance", "chi2", "residual"):
+        a, b = getattr(at_once, name), getattr(one_by_one, name)
+        assert torch.equal(a.isnan(), b.isnan())
+        assert torch.allclose(a.nan_to_num(0.0), b.nan_to_num(0.0), rtol=1e-12, atol=0), name
 
 
 def test_students_t_is_what_the_paper_on_it_says():

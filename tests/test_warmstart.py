@@ -13,12 +13,14 @@ import torch
 
 from tests.robots import T, csv_of, steel_rod, toml_of
 from tests.study import study1
+from tests.test_fast import needs_compiler
 from torchrod import (
     GaussianCoordinates,
     InputError,
     Markers,
     Model,
     PointCoordinates,
+    PointForces,
     Robot,
     Rod,
     Settings,
@@ -28,7 +30,9 @@ from torchrod import (
     WarmStart,
     cold_start,
     estimate,
+    fast,
     find_warm_start,
+    solve_shape,
 )
 from torchrod.cli import main
 from torchrod.features import GRID, features, smoothed
@@ -205,6 +209,41 @@ def test_a_start_that_leads_nowhere_is_followed_by_a_cold_one():
     assert (fit.iterations[retried] > cold.iterations[retried]).all()
     assert torch.allclose(fit.force, cold.force, atol=0.02)
     assert "cold start" in fit.message(int(retried.nonzero()[0, 0]))
+
+
+def test_a_failed_guess_is_followed_by_all_of_a_cold_start():
+    """A push whose cold fit needs a restart, and a guess that leads nowhere: the restart must follow it, too."""
+    rod = model_of().robot
+    s, force = torch.linspace(0.02, 0.4, 20), T([[[4.91, 0.0, 0.0]]])
+    p = solve_shape(rod, (PointForces(force, T([[0.379]])),), None, s, 1, 160).p
+    markers, model = Markers(s, p), model_of()
+    cold = estimate(model, markers, NOISE)
+    assert cold.restarts[0] > 0
+    assert cold.accepted[0], "of the case: it needs a restart, which helps"
+
+    def stuck(model, markers, noise):
+        x = estimate(model, markers, noise, Settings(restarts=())).x
+        return Start(x, None, torch.ones(1, dtype=torch.bool))
+
+    fit = estimate(model, markers, NOISE, start=stuck)
+    assert fit.learned[0] == int(Learned.RETRIED)
+    assert fit.accepted[0]
+    assert torch.allclose(fit.force, cold.force, atol=1e-3)
+    assert fit.restarts[0] == 1 + cold.restarts[0], "the cold start and its restarts, and nothing twice"
+
+
+@needs_compiler
+def test_the_compiled_layers_are_the_networks(monkeypatch):
+    """Also for inputs beyond what is known, and after the weights have been changed."""
+    network = WarmStart.read(ROD_1).network
+    x = 5 * torch.randn(11, network.inputs, generator=torch.Generator().manual_seed(0))
+    for scale in (1.0, 0.5):
+        for weight in network.parameters():
+            weight.mul_(scale)
+        compiled = network.hidden(x)
+        with monkeypatch.context() as without:
+            without.setattr(fast, "available", lambda: False)
+            assert torch.allclose(compiled, network.hidden(x), rtol=1e-12, atol=1e-14)
 
 
 def test_what_does_not_fit_is_said_in_one_sentence():

@@ -223,7 +223,8 @@ class Prepared:
     def cost(self, x: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
         """The cost of (3) with the prior's, r^T W r + (x0 - x)^T P (x0 - x)."""
         if self.compiled:
-            return fast.cost_now(x, *self._prior, self.tables(x).structure)
+            t = self.tables(x)  # which must outlive the call: the structure holds bare addresses
+            return fast.cost_now(x, *self._prior, t.structure)
         r = self.residual(self.h(x))
         s, _ = ekf.student((self.w * r * r)[:, :-6].unflatten(-1, (-1, 3)).sum(-1), self.nu)
         mean, precision = self._prior
