@@ -92,6 +92,7 @@ def test_what_does_not_settle_is_solved_in_the_definition(monkeypatch):
     assert asked == [1]
     keep = torch.tensor([0, 1, 3, 4])
     agree(Rest(found.wrench[keep], found.p[keep]), Rest(exact.wrench[keep], exact.p[keep]))
+    assert markers.tension is not None
     tension = markers.tension.clone()
     tension[1] = torch.nan
     found = at_rest(model, replace(markers, tension=tension), gamma)

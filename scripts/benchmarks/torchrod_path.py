@@ -13,18 +13,14 @@ from torchrod.prepared import Prepared
 
 from .cases import Case
 
-Filtered = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
-
-def one_iteration(prepared: Prepared, sums: fast.Sums, x: torch.Tensor, Sigma: torch.Tensor, cap: torch.Tensor) -> Filtered:
-    """One pass of the filter as torchrod.estimate does it: the next x, Sigma, cap, and who has converged.
+def one_iteration(prepared: Prepared, sums: fast.Sums, at: ekf.Iterate, Sigma0: torch.Tensor) -> None:
+    """One pass of the filter as torchrod.estimate does it, in place.
 
     This is what the tables call an iteration: h, H, the normal equations and the update. What is prepared once for all iterations
     of a fit is not in it.
     """
-    at = ekf.Iterate(x.clone(), Sigma.clone(), x.clone(), cap.clone(), torch.zeros(len(x), dtype=torch.bool))
-    prepared.iteration(at, Sigma, torch.ones_like(x[0]), ekf.Limits(), sums)(torch.arange(len(x)))
-    return at.x, at.Sigma, at.cap, at.done
+    prepared.iteration(at, Sigma0, torch.ones_like(at.x[0]), ekf.Limits(), sums)(torch.arange(len(at.x)))
 
 
 class TorchrodPeer:
@@ -49,11 +45,11 @@ class TorchrodPeer:
         """See `peers.Peer`; in the estimator's own chunks."""
         if self._ready[0] is not positions:
             self._ready = (positions, [self._prepared(positions[k : k + CHUNK]) for k in range(0, len(x), CHUNK)])
-        parts = []
+        after, before = (x.copy(), Sigma.copy(), x.copy(), cap.copy(), np.zeros(len(x), dtype=np.bool_)), torch.from_numpy(Sigma)
         for k, (prepared, sums) in enumerate(self._ready[1]):
             here = slice(k * CHUNK, (k + 1) * CHUNK)
-            parts.append(one_iteration(prepared, sums, *(torch.from_numpy(a[here]) for a in (x, Sigma, cap))))
-        return tuple(torch.cat(part).numpy() for part in zip(*parts, strict=True))
+            one_iteration(prepared, sums, ekf.Iterate(*(torch.from_numpy(a[here]) for a in after)), before[here])
+        return after[0], after[1], after[3], after[4]
 
     def _prepared(self, positions: np.ndarray) -> tuple[Prepared, fast.Sums]:
         markers = self.markers(positions)
