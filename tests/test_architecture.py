@@ -34,7 +34,7 @@ LAYERS = [
     {"robot"},
     {"loads", "tendons"},
     {"rod"},
-    {"lie", "jacobian", "status", "errors"},
+    {"lie", "jacobian", "status", "errors", "threads"},
 ]
 
 PACKAGES = ("io", "fast", "coordinates")

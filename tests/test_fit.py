@@ -105,8 +105,7 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     assert close(prepared.cost(x), expected.cost.sum(-1) + (precision * (mean - x) ** 2).sum(-1))
 
 
-@pytest.mark.parametrize("hold", [True, False])
-def test_one_iteration_of_the_filter(hold):
+def test_one_iteration_of_the_filter():
     """fast.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
     model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
     prepared = Prepared(model, markers, model.weights(markers, 0.1))
@@ -117,7 +116,7 @@ def test_one_iteration_of_the_filter(hold):
     start = ekf.Iterate(
         x.clone(), 0.2 * Sigma0, 0.9 * x.nan_to_num(1.0), T([9.0, 0.1, torch.inf, 1.0, 2.0]), torch.zeros(B, dtype=torch.bool)
     )
-    limits = ekf.Limits(hold=hold)
+    limits = ekf.Limits()
     expected = ekf.advance(start, prepared.normal(prepared.sums(x)), Sigma0, model.prior(), Q, limits)
     live = torch.tensor([0, 1, 3, 4])
     after = ekf.Iterate(*(getattr(start, k).clone() for k in ("x", "Sigma", "before", "cap", "done")))

@@ -243,7 +243,7 @@ def test_the_compiled_layers_are_the_networks(monkeypatch):
         compiled = network.hidden(x)
         with monkeypatch.context() as without:
             without.setattr(fast, "available", lambda: False)
-            assert torch.allclose(compiled, network.hidden(x), rtol=1e-12, atol=1e-14)
+            assert torch.allclose(compiled, network.hidden(x), rtol=1e-5, atol=1e-6 * scale), "single precision"
 
 
 def test_what_does_not_fit_is_said_in_one_sentence():

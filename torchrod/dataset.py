@@ -5,11 +5,9 @@ depend neither on the number of threads or processes, nor on the order of the sh
 The loads and the noise come from two streams: the same seed with another noise has the same loads.
 """
 
-import contextlib
 import hashlib
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -23,6 +21,7 @@ from .robot import Robot
 from .rod import DTYPE
 from .statics import solve_shape
 from .status import Status
+from .threads import one_thread
 
 SCHEMA = 1  # raise it when the same specification makes other arrays
 CHUNK = 256  # samples solved together: the working set stays in the cache, and other threads would only wait (measured)
@@ -184,17 +183,6 @@ def _solved(spec: DatasetSpec, robot: Robot, rng: np.random.Generator, count: in
     return {name: value[solved] for name, value in {**draw, "positions_clean": shape.p, "base_wrench": shape.base_wrench}.items()}
 
 
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch on one thread: faster on chunks this small, and no result can depend on how a sum was divided."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def simulate_shard(spec: DatasetSpec, index: int) -> dict[str, np.ndarray]:
     """The arrays of shard `index` by name, as in ARRAYS: float64, contiguous. A pure function of its arguments.
 
@@ -203,7 +191,7 @@ def simulate_shard(spec: DatasetSpec, index: int) -> dict[str, np.ndarray]:
     """
     robot, n = spec.robot_of(index), spec.samples_in(index)
     rng, blocks, drawn, kept = _stream(spec, index, 0), [], 0, 0
-    with _one_thread():
+    with one_thread():  # and no result can depend on how a sum was divided
         while kept < n:
             count = min(CHUNK, max(n - kept, LEAST_DRAW))
             blocks.append(_solved(spec, robot, rng, count))

@@ -114,15 +114,14 @@ class Limits(NamedTuple):
 
     step: the largest change of any entry of x. decrement, share: converged when a further step promises to lower the cost (chi^2)
     by less than this, or by less than this share of it: a model that cannot explain the data need not be fitted to round-off.
-    settled: the cost with adapted weights is at its minimum when a step promises less than this. hold: whether x stays where it is
-    done; otherwise it takes the step nevertheless.
+    settled: the cost with adapted weights is at its minimum when a step promises less than this. The step that shows that the
+    filter has arrived is taken nevertheless: it is there already, and leaves of the promised decrement next to nothing.
     """
 
     step: float = 0.6
     decrement: float = 1e-3
     share: float = 1e-6
     settled: float = 1.0
-    hold: bool = True
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,7 @@ def normal_equations(H: Float[Tensor, "B z n"], r: Float[Tensor, "B z"], w: Floa
 @dataclass(frozen=True)
 class Iterate:
     """Where the filter stands: x, the covariance Sigma of (1), the last x at which the model was sound, and the cap on the
-    inflation of the noise, which falls each time that the adapted problem has settled. done: whether x is where it will stay.
+    inflation of the noise, which falls each time that the adapted problem has settled. done: whether x has arrived.
     """
 
     x: Float[Tensor, "B n"]
@@ -221,7 +220,7 @@ def advance(
     # A model that overflowed says nothing: go half way back to the last place where it did.
     onward = torch.where(sound.unsqueeze(-1), at.x + limited(step, limits.step), 0.5 * (at.x + at.before))
     return Iterate(
-        torch.where(done.unsqueeze(-1), at.x, onward) if limits.hold else onward,
+        onward,
         torch.where(fresh[:, None, None], Sigma, Sigma0),
         torch.where(sound.unsqueeze(-1), at.x, at.before),
         cap,

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -24,6 +25,7 @@ class Rest:
     p: Float[Tensor, "B P 3"]
 
 
+@lru_cache(maxsize=32)  # so that what a coarse model knows of itself is worked out once
 def coarse(model: Model) -> Model:
     """The model with no more than COARSE_STEPS steps."""
     return model if model.steps <= COARSE_STEPS else replace(model, steps=COARSE_STEPS)

@@ -18,8 +18,10 @@ from .result import Estimate, make_estimate
 from .rod import DTYPE
 from .starts import Start, StartRule, better_start, cold_start, in_equilibrium
 from .status import Learned, Status
+from .threads import one_thread
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
+FEW = 16  # samples that one thread estimates sooner than two
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
@@ -154,7 +156,7 @@ def _filter(
     live = ok.nonzero().squeeze(-1)
     sums = Sums.room(len(x), model.size, len(markers.s))
     limits = ekf.Limits(step=settings.step_limit)
-    rough = replace(prepared, model=coarse(model)), limits._replace(decrement=NEAR, hold=False)
+    rough = replace(prepared, model=coarse(model)), limits._replace(decrement=NEAR)
     near = torch.full((len(x),), not settings.coarse or model.steps <= COARSE_STEPS)
     course = _Course((at, Sigma0, Q, sums), rough, (prepared, limits), live, near, settings.max_iterations)
     converged, iterations = course.at_once() if prepared.at_once else course.step_by_step()
@@ -163,7 +165,8 @@ def _filter(
     rest = (status != int(Status.CONVERGED)).nonzero().squeeze(-1)
     if len(rest):
         sums.put(rest, prepared.take(rest).sums(at.x[rest]))
-    return make_estimate(prepared, at.x, sums, status, iterations, start.warm)
+    evaluated = torch.where(converged.unsqueeze(-1), at.before, at.x)
+    return make_estimate(prepared, at.x, evaluated, sums, status, iterations, start.warm)
 
 
 @dataclass(frozen=True)
@@ -257,11 +260,13 @@ def estimate(
     """
     check(model, markers, noise)
     parts = []
-    size = CHUNK if served(model, markers.positions) else CHUNK_TORCH
-    for first in range(0, len(markers.positions), size):
-        index = torch.arange(first, min(first + size, len(markers.positions)))
-        chunk = _Chunk(model, markers.take(index), noise, settings or Settings())
-        parts.append(_fitted(chunk, start(model, chunk.markers, noise), progress))
+    compiled = served(model, markers.positions)
+    size = CHUNK if compiled else CHUNK_TORCH
+    with one_thread(compiled and len(markers.positions) <= FEW):
+        for first in range(0, len(markers.positions), size):
+            index = torch.arange(first, min(first + size, len(markers.positions)))
+            chunk = _Chunk(model, markers.take(index), noise, settings or Settings())
+            parts.append(_fitted(chunk, start(model, chunk.markers, noise), progress))
     return Estimate.cat(parts)
 
 

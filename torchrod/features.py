@@ -54,6 +54,7 @@ class Features:
 
     seen (B,): markers that were seen. alpha (B, 6): the base wrench without the unknown load (N, N m), zero where there is none.
     q_tip (B, 4): the orientation of the tip as the markers have it, to find the base wrench under a guessed load sooner.
+    p0 (B, P, 3): the markers (m) as they would be without the unknown load.
     """
 
     x: Float[Tensor, "B n"]
@@ -62,6 +63,7 @@ class Features:
     seen: Float[Tensor, " B"]
     alpha: Float[Tensor, "B 6"]
     q_tip: Float[Tensor, "B 4"]
+    p0: Float[Tensor, "B P 3"]
 
     def take(self, index: Int[Tensor, " b"]) -> "Features":
         """The samples of an index."""
@@ -162,7 +164,7 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
         moment = turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1)
         parts += [pull, moment, turned(weight), turned(p0[:, P : P + STATIONS] / L)]
     q_tip = _facing((p0[:, -1] + L * y[:, -1]) - (p0[:, -2] + L * y[:, -2]))
-    return Features(torch.cat(parts, -1), amp, turn, count, rest.wrench.nan_to_num(0.0), q_tip)
+    return Features(torch.cat(parts, -1), amp, turn, count, rest.wrench.nan_to_num(0.0), q_tip, p0[:, :P])
 
 
 def prior_log_c(model: Model) -> float:

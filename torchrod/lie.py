@@ -42,15 +42,19 @@ def inverse3(A: Matrix) -> Matrix:
 
 
 def rotate(q: Quaternion, a: Vector) -> Vector:
-    """R(q) a: from the section frame into the base frame."""
+    """q a q*, which is R(q) a, from the section frame into the base frame.
+
+    Within a step |q| is not quite 1. In this form R(q e) = R(q) R(e) even then, so that a step does not depend on the frame in
+    which it is seen.
+    """
     t = 2.0 * cross(q[..., :3], a)
-    return a + q[..., 3:] * t + cross(q[..., :3], t)
+    return (q * q).sum(-1, keepdim=True) * a + q[..., 3:] * t + cross(q[..., :3], t)
 
 
 def unrotate(q: Quaternion, a: Vector) -> Vector:
-    """R(q)^T a: from the base frame into the section frame."""
+    """q* a q, which is R(q)^T a, from the base frame into the section frame."""
     t = 2.0 * cross(q[..., :3], a)
-    return a - q[..., 3:] * t + cross(q[..., :3], t)
+    return (q * q).sum(-1, keepdim=True) * a - q[..., 3:] * t + cross(q[..., :3], t)
 
 
 def quaternion_rate(q: Quaternion, u: Vector) -> Quaternion:

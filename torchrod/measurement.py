@@ -8,6 +8,7 @@ the tip (17), less R^T of the unknown wrench there.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -237,7 +238,12 @@ class Model:
         return torch.cat([w[:, :-6], TIP_EXACT**2 * w[:, -6:]], -1)
 
     def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Mean and precision of every entry of x: the loads' own; weak on tip, 1 on theta, none on alpha, which (17) holds.
+        """Mean and precision of every entry of x."""
+        return self._prior
+
+    @cached_property
+    def _prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """The loads' own; weak on tip, 1 on theta, none on alpha, which (17) holds.
 
         zeta is zero within FRAME_SHIFT and FRAME_TURN: what a base frame is off by after it was once set up. A wider prior lets an
         unlikely frame pass for a push near the base: the error of the magnitude in Study 1 is half as large again (docs/trust.md).

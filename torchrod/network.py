@@ -98,13 +98,16 @@ class Network(torch.nn.Module):
         """The last hidden layer: by the compiled kernel where it serves and no derivative is wanted."""
         plain = x.dtype == self.mean.dtype == torch.float64 and x.device.type == "cpu"
         if plain and not self.head.weight.requires_grad and not x.requires_grad and fast.available():
-            return self._compiled(tuple(p._version for p in self.body.parameters()))(x)
-        return self.body(((x - self.mean) / self.std).clamp(-INPUT_LARGEST, INPUT_LARGEST))
+            return self._compiled(tuple(p._version for p in self.body.parameters()))(self._scaled(x))
+        return self.body(self._scaled(x))
+
+    def _scaled(self, x: Float[Tensor, "B i"]) -> Float[Tensor, "B i"]:
+        return ((x - self.mean) / self.std).clamp(-INPUT_LARGEST, INPUT_LARGEST)
 
     @lru_cache(maxsize=8)  # noqa: B019 - a handful of networks, kept with their copies
     def _compiled(self, versions: tuple[int, ...]) -> fast.Perceptron:
         """A copy of the weights as they are now; versions: changed with them."""
-        return fast.Perceptron([m for m in self.body if isinstance(m, torch.nn.Linear)], self.mean, self.std, INPUT_LARGEST)
+        return fast.Perceptron([m for m in self.body if isinstance(m, torch.nn.Linear)])
 
     def _gamma(
         self, z: Float[Tensor, "B width"], amp: Float[Tensor, " B"], log_c: Float[Tensor, " B"]

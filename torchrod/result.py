@@ -27,7 +27,8 @@ class Estimate:
     """Everything known of B samples after the fit. Status codes are torchrod.Status; SI units; forces in the section frame.
 
     x, covariance: the state in the model's coordinates and its posterior (H^T W H + P)^-1 with the true noise; covariances are NaN
-    where the fit has not converged.
+    where the fit has not converged. As in any Kalman filter x is one update further than the evaluation of the model that the
+    covariance, the residual, the centre line, cost and chi2 are of: by less than what 1e-3 of chi^2 can tell.
     force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
     net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
     tip (B, 6) [N, N m] and tip_covariance (B, 6, 6): the unknown dead wrench at the tip, base frame, zero in the entries that are
@@ -239,15 +240,16 @@ def _verdict(
 def make_estimate(
     prepared: Prepared,
     x: Float[Tensor, "B n"],
+    evaluated: Float[Tensor, "B n"],
     sums: Sums,
     status: Int[Tensor, " B"],
     iterations: Int[Tensor, " B"],
     warm_started: Bool[Tensor, " B"],
 ) -> Estimate:
-    """Assemble the result from the sums at x; a sample that is invalid holds NaN throughout."""
+    """Assemble the result from x and the sums where the model was last evaluated; an invalid sample holds NaN throughout."""
     model, markers = prepared.model, prepared.markers
     normal, prior = prepared.normal(sums), model.prior()
-    cost = normal.whole(x, *prior)[2]
+    cost = normal.whole(evaluated, *prior)[2]
     valid = (status != int(Status.INVALID)) & torch.isfinite(cost)
     status = torch.where(valid, status, int(Status.INVALID))
 
@@ -258,7 +260,7 @@ def make_estimate(
     settled = partial(where, status == int(Status.CONVERGED))  # elsewhere a spread would look like knowledge
     gamma, zeta, alpha = model.split(x)
     report = model.coordinates.describe(gamma)
-    covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(x, *prior)[0])
+    covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(evaluated, *prior)[0])
     free = _tensions(prepared, x, covariance)
     outlier, chi2, dof, explained = _verdict(prepared, sums, cost)
     return Estimate(

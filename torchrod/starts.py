@@ -17,13 +17,15 @@ class Start:
     """Where B samples start: x (B, n) in the model's coordinates.
 
     Sigma0: the covariance (B, n, n) to start with; None leaves it to the settings. warm: (B,), which samples start from a guess;
-    the others start cold, from no load. cold: x of a cold start, if the rule has it at hand.
+    the others start cold, from no load. cold: x of a cold start, and costs (B, 2) of x and of that by the model, if the rule has
+    them at hand.
     """
 
     x: Float[Tensor, "B n"]
     Sigma0: Float[Tensor, "B n n"] | None
     warm: Bool[Tensor, " B"]
     cold: Float[Tensor, "B n"] | None = None
+    costs: Float[Tensor, "B 2"] | None = None
 
 
 StartRule = Callable[[Model, Markers, float], Start]
@@ -37,6 +39,16 @@ def in_equilibrium(
     q_tip: the orientation of the tip near which to look, where it is known: sooner found.
     """
     return model.join(gamma, at_rest(model, markers, gamma, q_tip).wrench.nan_to_num(0.0))
+
+
+def cost_in_equilibrium(
+    model: Model, markers: Markers, noise: float, x: Float[Tensor, "B n"], p: Float[Tensor, "B P 3"]
+) -> Float[Tensor, " B"]:
+    """The cost of (3) with the prior's at x, whose shape p (m) in equilibrium is known at the markers: there is no tip residual."""
+    mean, precision = model.prior()
+    w = model.weights(markers, noise)[:, :-6]
+    r = torch.where(w > 0, (markers.positions - p).flatten(1), 0.0)
+    return (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
 
 
 def cold_start(model: Model, markers: Markers, noise: float) -> Start:
@@ -55,16 +67,21 @@ def better_start(
 ) -> tuple[Start, Bool[Tensor, " B"]]:
     """Per warm sample, the cheaper of its guess and a cold start, and which guesses were dropped, (B,).
 
-    Sigma0 is what a cold start goes with. Each costs one evaluation of h without its Jacobian, on coarse steps. A guess that is not
-    finite, or that bends the rod out of all bounds, is dropped with the rest.
+    Sigma0 is what a cold start goes with. Where the rule does not have their costs, each takes one evaluation of h without its
+    Jacobian, on coarse steps. A guess that is not finite, or that bends the rod out of all bounds, is dropped with the rest.
     """
     index = start.warm.nonzero().squeeze(-1)
     if not len(index):
         return start, start.warm
     cold = cold_start(model, markers.take(index), noise).x if start.cold is None else start.cold[index]
-    part = markers if len(index) == len(start.warm) else markers.take(index)
-    prepared = Prepared(coarse(model), part, model.weights(part, noise))
-    worse = ~(prepared.cost(start.x[index]).nan_to_num(torch.inf) < prepared.cost(cold).nan_to_num(torch.inf))
+    if start.costs is None:
+        part = markers if len(index) == len(start.warm) else markers.take(index)
+        prepared = Prepared(coarse(model), part, model.weights(part, noise))
+        costs = torch.stack([prepared.cost(start.x[index]), prepared.cost(cold)], -1)
+    else:
+        costs = start.costs[index]
+    guessed, known = costs.nan_to_num(torch.inf).unbind(-1)
+    worse = ~(guessed < known)
     dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
     x = start.x.clone()
     x[dropped] = cold[worse]

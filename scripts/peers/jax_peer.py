@@ -26,9 +26,9 @@ Array = Any
 
 
 def rotate(q: Array, a: Array) -> Array:
-    """R(q) a."""
+    """q a q*."""
     t = 2.0 * jnp.cross(q[:3], a)
-    return a + q[3] * t + jnp.cross(q[:3], t)
+    return (q @ q) * a + q[3] * t + jnp.cross(q[:3], t)
 
 
 def exponential(r: Array) -> Array:
@@ -175,7 +175,7 @@ class JaxPeer:
         step = Sigma @ g
         cap = jnp.where((g @ step) < SETTLED, 0.1 * inflated, cap)
         fresh = jnp.isfinite(Sigma).all() & finite
-        step = jnp.where(fresh & ~done, step * jnp.minimum(1.0, STEP_LIMIT / jnp.abs(step).max()), 0.0)
+        step = jnp.where(fresh, step * jnp.minimum(1.0, STEP_LIMIT / jnp.abs(step).max()), 0.0)
         return x + step, jnp.where(fresh, Sigma, jnp.eye(len(x))), cap, done, cost
 
     def _posterior(self, x: Array, z: Array, w: Array) -> Array:

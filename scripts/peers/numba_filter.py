@@ -134,7 +134,7 @@ def onward(lanes, w, f, inflated):
                 w.x[i, lane] = 0.5 * (here + f.before[i, lane])
                 continue
             f.before[i, lane] = here
-            if fresh and not f.done[lane]:
+            if fresh:
                 w.x[i, lane] = here + share * f.y[i, lane]
         if not (fresh and finite):
             for i in range(n):

@@ -38,10 +38,11 @@ def _rates(k, qx, qy, qz, qw, nx, ny, nz, mx, my, mz, gx, gy):
     fx, fy, fz = _cross(nx, ny, nz, ux, uy, uz)
     ex, ey, ez = _cross(mx, my, mz, ux, uy, uz)
     cx, cy, cz = _cross(nx, ny, nz, vx, vy, vz)
+    size = qx * qx + qy * qy + qz * qz + qw * qw
     return (
-        vx + qw * tx + rx,
-        vy + qw * ty + ry,
-        vz + qw * tz + rz,
+        size * vx + qw * tx + rx,
+        size * vy + qw * ty + ry,
+        size * vz + qw * tz + rz,
         0.5 * (qw * ux + ax),
         0.5 * (qw * uy + ay),
         0.5 * (qw * uz + az),
@@ -76,10 +77,11 @@ def _rate_tangents(k, qx, qy, qz, qw, nx, ny, nz, mx, my, mz, dqx, dqy, dqz, dqw
     ix, iy, iz = _cross(mx, my, mz, dux, duy, duz)
     jx, jy, jz = _cross(dnx, dny, dnz, vx, vy, vz)
     lx, ly, lz = _cross(nx, ny, nz, dvx, dvy, dvz)
+    size, growth = qx * qx + qy * qy + qz * qz + qw * qw, 2.0 * (qx * dqx + qy * dqy + qz * dqz + qw * dqw)
     return (
-        dvx + dqw * tx + qw * sx + ax + bx,
-        dvy + dqw * ty + qw * sy + ay + by,
-        dvz + dqw * tz + qw * sz + az + bz,
+        size * dvx + growth * vx + dqw * tx + qw * sx + ax + bx,
+        size * dvy + growth * vy + dqw * ty + qw * sy + ay + by,
+        size * dvz + growth * vz + dqw * tz + qw * sz + az + bz,
         0.5 * (dqw * ux + qw * dux + cx + ex),
         0.5 * (dqw * uy + qw * duy + cy + ey),
         0.5 * (dqw * uz + qw * duz + cz + ez),

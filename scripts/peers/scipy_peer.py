@@ -62,7 +62,7 @@ class ScipyPeer:
         moment[0] += g[1]
         moment[1] -= g[0]
         turned = 0.5 * np.concatenate([q[3] * u + cross(q[:3], u), -(q[:3] * u).sum(0, keepdims=True)])
-        return np.concatenate([v + q[3] * t + cross(q[:3], t), turned, cross(N, u), moment])
+        return np.concatenate([(q * q).sum(0) * v + q[3] * t + cross(q[:3], t), turned, cross(N, u), moment])
 
     def h(self, x: np.ndarray) -> np.ndarray:
         """h(x), (B, z)."""

@@ -50,7 +50,7 @@ struct Inverse {
 
 struct Filter {
     const double *mean, *precision, *Q;  // (n)
-    double step_limit, decrement, decrement_share, settled, hold;  // hold: whether x stays where it is done
+    double step_limit, decrement, decrement_share, settled;
     // In and out, (B, n), (B, n, n), (B, n), (B), (B); then out: (B) whether converged.
     double *x, *Sigma, *before, *cap;
     const double* Sigma0;  // (B, n, n)
@@ -115,7 +115,7 @@ inline void advance(const Filter& f, const Lanes& lanes, int64_t n, const Normal
         for (int64_t i = 0; i < n; i++) {
             const double was = x[i][l], half = 0.5 * (was + f.before[b * n + i]);
             if (sound[l]) f.before[b * n + i] = was;
-            if (!done[l] || !f.hold) f.x[b * n + i] = sound[l] ? was + step[i][l] * shorten[l] : half;
+            f.x[b * n + i] = sound[l] ? was + step[i][l] * shorten[l] : half;
         }
         for (int64_t k = 0; k < n * n; k++) f.Sigma[b * n * n + k] = fresh[l] ? Sigma[k][l] : f.Sigma0[b * n * n + k];
     }

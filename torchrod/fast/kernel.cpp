@@ -1,7 +1,7 @@
 // The library's entry points: each shares its samples among threads, in groups of W.
 
+#include <algorithm>
 #include <thread>
-#include <functional>
 
 #include "balance.h"
 #include "filter.h"
@@ -9,9 +9,19 @@
 
 namespace {
 
+// work(from, to) for shares of 0 .. count, one to a thread.
+template <class Work> void in_parts(int64_t count, int64_t threads, Work work) {
+    if (threads > count) threads = count;
+    if (threads <= 1) return work(int64_t(0), count);
+    std::vector<std::thread> pool;
+    for (int64_t t = 1; t < threads; t++) pool.emplace_back(work, count * t / threads, count * (t + 1) / threads);
+    work(int64_t(0), count / threads);
+    for (auto& thread : pool) thread.join();
+}
+
+// work(lanes, room, numbers) for groups of W samples.
 template <class Work> void in_groups(int64_t count, const int64_t* index, int64_t threads, Work work) {
-    const int64_t groups = (count + W - 1) / W;
-    auto some = [&](int64_t from, int64_t to) {
+    in_parts((count + W - 1) / W, threads, [&](int64_t from, int64_t to) {
         Room room;
         std::vector<V> numbers;
         for (int64_t g = from; g < to; g++) {
@@ -23,13 +33,7 @@ template <class Work> void in_groups(int64_t count, const int64_t* index, int64_
             }
             work(lanes, room, numbers);
         }
-    };
-    if (threads > groups) threads = groups;
-    if (threads <= 1) return some(0, groups);
-    std::vector<std::thread> pool;
-    for (int64_t t = 1; t < threads; t++) pool.emplace_back(some, groups * t / threads, groups * (t + 1) / threads);
-    some(0, groups / threads);
-    for (auto& thread : pool) thread.join();
+    });
 }
 
 }  // namespace
@@ -50,6 +54,7 @@ void torchrod_march(const March* m, int64_t threads) {
     const int64_t n = m->tangents, g = m->load_tangents, points = 3 * known.steps;
     in_groups(m->batch, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
         Group group{&known, lanes, n, g, 0, 0, nullptr, nullptr, nullptr, {}, {}};
+        group.stretching = true;  // whoever calls may ask for any tangent
         if (m->local) {
             room.local.resize((points + 1) * (1 + g) * PARTS);
             for (int64_t p = 0; p < points; p++)
@@ -184,12 +189,7 @@ static void run(const Course& c, const int64_t* index, int64_t count) {
 }
 
 void torchrod_filter(const Course* c, const int64_t* index, int64_t count, int64_t threads) {
-    if (threads <= 1) return run(*c, index, count);
-    std::vector<std::thread> pool;
-    for (int64_t t = 1; t < threads; t++)
-        pool.emplace_back(run, std::cref(*c), index + count * t / threads, count * (t + 1) / threads - count * t / threads);
-    run(*c, index, count / threads);
-    for (auto& thread : pool) thread.join();
+    in_parts(count, threads, [&](int64_t from, int64_t to) { run(*c, index + from, to - from); });
 }
 
 // The base wrench (b, 6) in equilibrium with the loads of x (b, n), how far it is from that (b), the centre line (b, P, 3) and the
@@ -212,16 +212,20 @@ void torchrod_balance(const Fit* f, const double* x, const double* q_tip, int64_
 }
 
 // A perceptron's output (b, last size) from its input (b, first size).
-void torchrod_perceptron(const Perceptron* p, const double* x, int64_t count, double* y, int64_t threads) {
-    const int64_t in = p->sizes[0], out = p->sizes[p->depth];
-    int64_t widest = 0;
-    for (int64_t k = 0; k <= p->depth; k++) widest = p->sizes[k] > widest ? p->sizes[k] : widest;
-    in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room&, std::vector<V>& numbers) {
-        numbers.resize(2 * widest);
-        for (int64_t i = 0; i < in; i++) numbers[i] = fetch({x, in}, lanes, i);
-        const V* found = perceptron(*p, numbers.data(), widest);
-        for (int64_t l = 0; l < lanes.count; l++)
-            for (int64_t o = 0; o < out; o++) y[lanes.sample[l] * out + o] = found[o][l];
+void torchrod_perceptron(const Perceptron* p, const float* x, int64_t count, float* y, int64_t threads) {
+    const int64_t in = p->sizes[0], out = p->sizes[p->depth], block = FLOATS * BLOCK, blocks = (count + block - 1) / block;
+    const int64_t widest = *std::max_element(p->sizes, p->sizes + p->depth + 1);
+    in_parts(blocks, threads, [&](int64_t from, int64_t to) {
+        std::vector<F> numbers(2 * widest * BLOCK);
+        for (int64_t first = from * block; first < to * block; first += block) {
+            const int64_t here = count - first < block ? count - first : block;
+            for (int64_t l = 0; l < block; l++)
+                for (int64_t i = 0; i < in; i++)
+                    numbers[i * BLOCK + l / FLOATS][l % FLOATS] = x[(first + (l < here ? l : 0)) * in + i];
+            const F* found = perceptron(*p, numbers.data(), widest);
+            for (int64_t l = 0; l < here; l++)
+                for (int64_t o = 0; o < out; o++) y[(first + l) * out + o] = found[o * BLOCK + l / FLOATS][l % FLOATS];
+        }
     });
 }
 

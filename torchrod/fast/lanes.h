@@ -86,19 +86,19 @@ INLINE V3 matvec4(const V* A, const V* x) {  // (3, 4)
     return r;
 }
 
-// R(q) a with q = (vector, w): lie.py, rotate; with the vector reversed, unrotate.
+// R(q) a = q a q* with q = (vector, w): lie.py, rotate; with the vector reversed, unrotate.
 INLINE V3 turned(const V3& q, V w, const V3& a) {
     const V3 t = splat(2.0) * cross(q, a);
-    return a + w * t + cross(q, t);
+    return (w * w + dot(q, q)) * a + w * t + cross(q, t);
 }
-// How it moves with q, (3, 4): 2 [w e_k x a + q a_k + e_k (q . a) - 2 a q_k], and 2 q x a by w. sign = -1: of unrotate.
+// How it moves with q, (3, 4): 2 [w e_k x a + q a_k + e_k (q . a) - a q_k], and 2 (q x a + w a) by w. sign = -1: of unrotate.
 INLINE void turning(const V3& q, V w, double sign, const V3& a, V* J) {
     const V3 by_w = cross(q, a);
     const V along = dot(q, a), s = sign * w;
     const V hat[9] = {V{}, -a.c[2], a.c[1], a.c[2], V{}, -a.c[0], -a.c[1], a.c[0], V{}};
     for (int i = 0; i < 3; i++) {
         for (int k = 0; k < 3; k++)
-            J[4 * i + k] = 2.0 * (q.c[i] * a.c[k] - s * hat[3 * i + k] - 2.0 * a.c[i] * q.c[k] + (i == k ? along : V{}));
-        J[4 * i + 3] = (2.0 * sign) * by_w.c[i];
+            J[4 * i + k] = 2.0 * (q.c[i] * a.c[k] - s * hat[3 * i + k] - a.c[i] * q.c[k] + (i == k ? along : V{}));
+        J[4 * i + 3] = 2.0 * (sign * by_w.c[i] + w * a.c[i]);
     }
 }

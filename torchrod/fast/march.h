@@ -3,52 +3,7 @@
 
 #include <vector>
 
-#include "section.h"
-
-constexpr int STATE = 13, PARTS = 5;  // of the state p, q, N~, M~; of a local load: G_x, G_y, G_z, G2_x, G2_y
-
-// One group of samples. Tangents are ordered [loads | tensions | the rest]; only the first two move what is known along the rod.
-struct Group {
-    const Known* known;
-    Lanes lanes;
-    int64_t tangents, load_tangents, tension_tangents;
-    double tension_unit;  // N, of one unit of a tension tangent
-    const V* tension;     // (tension_tangents), what the tensions' unknowns add (N)
-    const V* local;       // (3 S + 1, 1 + load_tangents, PARTS): the stages of every step, then beyond the tip; or null
-    const V* node_moves;  // (S + 1, load_tangents): how the nodes move; null where they do not
-    Table weight;         // (3) N/m, the slope -dWn/ds where nodes move
-    Table active;         // (S, 3, T), 1 where a tendon pulls; unless tensions are free there is none
-    double dead = 1;      // the part of Wn and Wm that is on
-
-    const V* local_at(int64_t row) const { return local ? local + row * (1 + load_tangents) * PARTS : nullptr; }
-    const V* local_slope(int64_t row, int64_t j) const {
-        return local && j < load_tangents ? local_at(row) + (1 + j) * PARTS : nullptr;
-    }
-};
-
-inline void stage_of(const Group& g, int64_t row, Stage& s) {
-    const Known& m = *g.known;
-    const V* l = g.local_at(row);
-    s.G = l ? part(l) : V3{}, s.G2x = l ? l[3] : V{}, s.G2y = l ? l[4] : V{};
-    s.Wn_there = m.Wn.data, s.Wm_there = m.Wm.data;
-    for (int c = 0; c < 3; c++) {
-        s.Gm.c[c] = m.Gm.data ? fetch(m.Gm, g.lanes, 3 * row + c) : V{};
-        if (s.Wn_there) s.Wn.c[c] = g.dead * fetch(m.Wn, g.lanes, 3 * row + c);
-        if (s.Wm_there) s.Wm.c[c] = g.dead * fetch(m.Wm, g.lanes, 3 * row + c);
-        s.u_star.c[c] = fetch(m.u_star, g.lanes, 3 * row + c);
-    }
-    for (int64_t x = 0; x < 18 * m.tendons; x++) s.L[x] = fetch(m.L, g.lanes, row * 18 * m.tendons + x);
-    for (int64_t x = 0; x < 3 * m.tendons; x++) s.dr[x] = fetch(m.dr, g.lanes, row * 3 * m.tendons + x);
-    for (int64_t t = 0; t < m.tendons; t++) {
-        s.tau[t] = fetch(m.tau, g.lanes, row * m.tendons + t);
-        s.tau_unit[t] = V{};
-        if (t >= g.tension_tangents) continue;  // else tau = max(reading + unknown, 0) where the tendon pulls at all
-        const Mask on = fetch(g.active, g.lanes, row * m.tendons + t) > 0;
-        const V pull = s.tau[t] + g.tension[t];
-        s.tau[t] = select(on, larger(pull, V{}), V{});
-        s.tau_unit[t] = select(on & (pull > 0), splat(g.tension_unit), V{});
-    }
-}
+#include "body.h"
 
 // What rk4_step leaves for its tangents: every evaluation's slope and value, the state before q is made a unit again.
 struct Trace {
@@ -118,20 +73,50 @@ template <bool Plain, bool Moving> __attribute__((noinline)) void rk4_tangent(co
     for (int c = 0; c < 4; c++) dy[3 + c] = t.inverse * (dy[3 + c] - along * t.unscaled[c]);
 }
 
+// As `walk`, where body.h serves: tangents are carried in the section's own frame and shown in the base frame.
+template <class Arrive> void walk_in_own_frame(const Group& g, V* y, V* dy, bool reverse, Arrive arrive) {
+    const int64_t steps = g.known->steps;
+    static thread_local std::vector<V> carried;
+    static thread_local BodyStep step;
+    carried.resize(g.tangents * CARRIED);
+    V R[9];
+    rotation(y, R);
+    for (int64_t j = 0; j < g.tangents; j++) to_own_frame(y, R, dy + j * STATE, carried.data() + j * CARRIED);
+    arrive(reverse ? steps : 0, [] {});
+    for (int64_t n = 0; n < steps; n++) {
+        const int64_t i = reverse ? steps - 1 - n : n;
+        body_step(g, y, i, reverse, step);
+        for (int64_t j = 0; j < g.tangents; j++) {
+            V* tangent = carried.data() + j * CARRIED;
+            if (j < g.load_tangents) body_tangent<true>(g, step, j, tangent);
+            else body_tangent<false>(g, step, j, tangent);
+        }
+        arrive(reverse ? i : i + 1, [&] {
+            rotation(y, R);
+            for (int64_t j = 0; j < g.tangents; j++) to_base_frame(y, R, carried.data() + j * CARRIED, g.turning, dy + j * STATE);
+        });
+    }
+}
+
 // From y at one end to the other, with dy (tangents, STATE). sink(p, mask) is told of every output p as the lanes of `mask` arrive at
 // its node.
 template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink sink) {
     const Known& m = *g.known;
-    const bool plain = !m.tendons && !m.Wn.data && !m.Wm.data;
-    auto arrive = [&](int64_t node) {
+    auto arrive = [&](int64_t node, auto before) {
+        bool ready = false;
         for (int64_t p = 0; p < m.outputs; p++) {
             if (m.at.stride == 0 && m.at.data[p] != node) continue;
             const Mask here = reached(m.at, g.lanes, p, node);
-            if (any(here)) sink(p, here);
+            if (!any(here)) continue;
+            if (!ready) before();
+            ready = true;
+            sink(p, here);
         }
     };
+    if (g.in_own_frame()) return walk_in_own_frame(g, y, dy, reverse, arrive);
+    const bool plain = !m.tendons && !m.Wn.data && !m.Wm.data;
     static thread_local Trace trace;
-    arrive(reverse ? m.steps : 0);
+    arrive(reverse ? m.steps : 0, [] {});
     for (int64_t n = 0; n < m.steps; n++) {
         const int64_t i = reverse ? m.steps - 1 - n : n;
         rk4_step(g, y, i, reverse, trace);
@@ -141,6 +126,6 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
             else if (plain) rk4_tangent<true, false>(g, trace, j, tangent);
             else rk4_tangent<false, false>(g, trace, j, tangent);
         }
-        arrive(reverse ? i : i + 1);
+        arrive(reverse ? i : i + 1, [] {});
     }
 }

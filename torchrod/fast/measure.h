@@ -76,7 +76,9 @@ template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, bool sl
     const int64_t g = f.loads.size;
     room.tension.resize(f.tensions);
     for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(g + f.tip + t);
-    Group group{&m, lanes, slopes ? g + f.tensions + PLAIN : 0, slopes ? g : 0, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active};
+    const int64_t tangents = slopes ? g + f.tensions + PLAIN : 0;
+    Group group{&m, lanes, tangents, slopes ? g : 0, f.tensions, f.tension_unit, room.tension.data(), nullptr, nullptr, f.weight, f.active};
+    group.turning = f.offsets || f.tip;
     if (f.loads.family == POINT && slopes) {
         room.moves.resize((m.steps + 1) * g);
         move_nodes(f.loads, group, x, room.moves.data());

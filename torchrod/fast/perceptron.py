@@ -10,20 +10,30 @@ from . import structures
 from .fitting import run
 from .structures import fill
 
+OUT = 4  # of mlp.h
+
+
+def _packed(layer: torch.nn.Linear, into: int) -> Float[Tensor, " m"]:
+    """Bias and weights as mlp.h has them, filled up with zeros to `into` inputs and a multiple of OUT outputs."""
+    w = torch.cat([layer.bias.detach().unsqueeze(-1), layer.weight.detach()], -1)
+    w = torch.nn.functional.pad(w, (0, into + 1 - w.shape[1], 0, -len(w) % OUT))
+    return w.unflatten(0, (-1, OUT)).mT.reshape(-1)
+
 
 class Perceptron:
-    """Layers y = GELU(W x + b), of an input that is centred, scaled and clipped at +- largest; all float64."""
+    """Layers y = GELU(W x + b), in single precision."""
 
-    def __init__(self, layers: list[torch.nn.Linear], mean: Float[Tensor, " i"], std: Float[Tensor, " i"], largest: float):
-        sizes = [layers[0].in_features, *(layer.out_features for layer in layers)]
-        parts = [part for layer in layers for part in (layer.weight.detach().mT.reshape(-1), layer.bias.detach())]
-        self._held = {"sizes": torch.tensor(sizes), "mean": mean.contiguous(), "std": std.contiguous(), "weights": torch.cat(parts)}
-        self._structure, self.outputs = structures.Perceptron(), sizes[-1]
-        fill(self._structure, self._held, {"depth": len(layers), "largest": largest})
+    def __init__(self, layers: list[torch.nn.Linear]):
+        sizes = [layers[0].in_features, *(layer.out_features + -layer.out_features % OUT for layer in layers)]
+        parts = [_packed(layer, into) for layer, into in zip(layers, sizes, strict=False)]
+        self._held = {"sizes": torch.tensor(sizes), "weights": torch.cat(parts).float()}
+        self._structure, self._padded, self.outputs = structures.Perceptron(), sizes[-1], layers[-1].out_features
+        fill(self._structure, self._held, {"depth": len(layers)})
 
     def __call__(self, x: Float[Tensor, "B i"]) -> Float[Tensor, "B o"]:
-        """The last layer's output."""
-        x, y = x.contiguous(), x.new_empty(len(x), self.outputs)
-        addresses = [ctypes.c_void_p(t.data_ptr()) for t in (x, y)]
+        """The last layer's output, in the precision of the input."""
+        given = x.float().contiguous()
+        y = given.new_empty(len(x), self._padded)
+        addresses = [ctypes.c_void_p(t.data_ptr()) for t in (given, y)]
         run("torchrod_perceptron", len(x), ctypes.byref(self._structure), addresses[0], ctypes.c_int64(len(x)), addresses[1])
-        return y
+        return y[:, : self.outputs].to(x.dtype)

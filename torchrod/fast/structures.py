@@ -56,7 +56,7 @@ class Filter(ctypes.Structure):
 
     _fields_ = [
         *((n, _P) for n in ("mean", "precision", "Q")),
-        *((n, _D) for n in ("step", "decrement", "share", "settled", "hold")),
+        *((n, _D) for n in ("step", "decrement", "share", "settled")),
         *((n, _P) for n in ("x", "Sigma", "before", "cap", "Sigma0", "done")),
     ]
 
@@ -64,7 +64,7 @@ class Filter(ctypes.Structure):
 class Perceptron(ctypes.Structure):
     """struct Perceptron."""
 
-    _fields_ = [("depth", _I), *((n, _P) for n in ("sizes", "mean", "std")), ("largest", _D), ("weights", _P)]
+    _fields_ = [("depth", _I), ("sizes", _P), ("weights", _P)]
 
 
 class Course(ctypes.Structure):

@@ -1,0 +1,54 @@
+// The samples of one group, and what is known at a stage of a step for them.
+#pragma once
+
+#include "section.h"
+
+constexpr int STATE = 13, PARTS = 5;  // of the state p, q, N~, M~; of a local load: G_x, G_y, G_z, G2_x, G2_y
+
+// One group of samples. Tangents are ordered [loads | tensions | the rest]; only the first two move what is known along the rod.
+struct Group {
+    const Known* known;
+    Lanes lanes;
+    int64_t tangents, load_tangents, tension_tangents;
+    double tension_unit;  // N, of one unit of a tension tangent
+    const V* tension;     // (tension_tangents), what the tensions' unknowns add (N)
+    const V* local;       // (3 S + 1, 1 + load_tangents, PARTS): the stages of every step, then beyond the tip; or null
+    const V* node_moves;  // (S + 1, load_tangents): how the nodes move; null where they do not
+    Table weight;         // (3) N/m, the slope -dWn/ds where nodes move
+    Table active;         // (S, 3, T), 1 where a tendon pulls; unless tensions are free there is none
+    double dead = 1;      // the part of Wn and Wm that is on
+    bool stretching = false;  // whether a first tangent may change |q|, which only the step in the base frame can carry
+    bool turning = true;      // whether anybody asks how q moves at the outputs
+
+    bool in_own_frame() const {  // whether body.h serves
+        return known->diagonal && !known->tendons && !known->Wn.data && !known->Wm.data && !node_moves && !stretching;
+    }
+    const V* local_at(int64_t row) const { return local ? local + row * (1 + load_tangents) * PARTS : nullptr; }
+    const V* local_slope(int64_t row, int64_t j) const {
+        return local && j < load_tangents ? local_at(row) + (1 + j) * PARTS : nullptr;
+    }
+};
+
+inline void stage_of(const Group& g, int64_t row, Stage& s) {
+    const Known& m = *g.known;
+    const V* l = g.local_at(row);
+    s.G = l ? part(l) : V3{}, s.G2x = l ? l[3] : V{}, s.G2y = l ? l[4] : V{};
+    s.Wn_there = m.Wn.data, s.Wm_there = m.Wm.data;
+    for (int c = 0; c < 3; c++) {
+        s.Gm.c[c] = m.Gm.data ? fetch(m.Gm, g.lanes, 3 * row + c) : V{};
+        if (s.Wn_there) s.Wn.c[c] = g.dead * fetch(m.Wn, g.lanes, 3 * row + c);
+        if (s.Wm_there) s.Wm.c[c] = g.dead * fetch(m.Wm, g.lanes, 3 * row + c);
+        s.u_star.c[c] = fetch(m.u_star, g.lanes, 3 * row + c);
+    }
+    for (int64_t x = 0; x < 18 * m.tendons; x++) s.L[x] = fetch(m.L, g.lanes, row * 18 * m.tendons + x);
+    for (int64_t x = 0; x < 3 * m.tendons; x++) s.dr[x] = fetch(m.dr, g.lanes, row * 3 * m.tendons + x);
+    for (int64_t t = 0; t < m.tendons; t++) {
+        s.tau[t] = fetch(m.tau, g.lanes, row * m.tendons + t);
+        s.tau_unit[t] = V{};
+        if (t >= g.tension_tangents) continue;  // else tau = max(reading + unknown, 0) where the tendon pulls at all
+        const Mask on = fetch(g.active, g.lanes, row * m.tendons + t) > 0;
+        const V pull = s.tau[t] + g.tension[t];
+        s.tau[t] = select(on, larger(pull, V{}), V{});
+        s.tau_unit[t] = select(on & (pull > 0), splat(g.tension_unit), V{});
+    }
+}
