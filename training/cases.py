@@ -27,9 +27,10 @@ from torchrod import (
     simulate_shard,
     solve_shape,
 )
-from torchrod.estimator import CHUNK, linearize
+from torchrod.estimator import CHUNK
 from torchrod.features import features, prior_log_c
 from torchrod.network import PER_LOAD, turn_of_gamma
+from torchrod.prepared import Prepared
 from torchrod.starts import in_equilibrium
 
 L, DIAMETER, E, G = 0.4, 0.0014, 207e9, 79e9  # of the rod; the features are dimensionless, so one rod stands for all
@@ -178,7 +179,8 @@ def with_gaps(markers: Markers, generator: torch.Generator) -> Markers:
 
 def information(model: Model, markers: Markers, noise: float, x: Float[Tensor, "B n"], size: int) -> Float[Tensor, "B g g"]:
     """M: the information on gamma with alpha eliminated, so that d^T M d is what an error d in gamma costs."""
-    A = linearize(model, x, markers, model.weights(markers, noise)).A
+    prepared = Prepared(model, markers, model.weights(markers, noise))
+    A, _, _ = prepared.normal(prepared.sums(x)).whole(x, *model.prior())
     cross = A[:, :size, size:]
     return A[:, :size, :size] - cross @ torch.linalg.solve(A[:, size:, size:], cross.mT)
 
