@@ -11,8 +11,10 @@ from reproduction.study2 import force_error
 from torch import Tensor
 
 from torchrod import Estimate, Markers, Model, Settings, Start, Status, cold_start, ekf, estimate, find_warm_start
+from torchrod.equilibrium import at_rest
 from torchrod.estimator import CHUNK, CHUNK_TORCH, linearize
 from torchrod.fast import Sums, available
+from torchrod.features import features
 from torchrod.loads import Load
 from torchrod.prepared import Prepared
 from torchrod.starts import StartRule, better_start
@@ -160,7 +162,9 @@ def runs(case: Case, progress: Callable[[], object]) -> dict[str, Run]:
 
 
 def start_times(part: Part) -> dict[str, float]:
-    """CPU seconds for a batch of TIMED_BATCH: the guess with its check against a cold start, a cold start, one filter iteration."""
+    """CPU seconds for a batch of TIMED_BATCH: the guess with its check against a cold start; the forward solves in it, without the
+    load (a cold start) and with the guessed one; one filter iteration.
+    """
     model, noise = part.model, part.noise
     markers = part.markers.take(torch.arange(TIMED_BATCH) % len(part.oracle))
     warm, w = rules(part)["warm"](torch.arange(0)), model.weights(markers, noise)
@@ -170,14 +174,18 @@ def start_times(part: Part) -> dict[str, float]:
     at = ekf.Iterate(x.clone(), many.clone(), x.clone(), torch.full_like(x[:, 0], torch.inf), none)
     once = Prepared(model, markers, w).iteration(at, many, Q, ekf.Limits(), Sums.room(len(x), model.size, len(markers.s)))
 
+    guess = warm(model, markers, noise)
+    gamma, index = model.split(guess.x)[0], guess.warm.nonzero().squeeze(-1)
+    loaded, q_tip = markers.take(index), features(model, markers, noise).q_tip[index]
     return {
+        "solve_s": best_of(lambda: at_rest(model, loaded, gamma[index], q_tip)) if len(index) else 0.0,
         "start_s": best_of(lambda: better_start(model, markers, noise, warm(model, markers, noise), Sigma0)),
         "cold_s": best_of(lambda: cold_start(model, markers, noise)),
         "iteration_s": best_of(lambda: once(torch.arange(len(x)))),
     }
 
 
-def best_of(what: Callable[[], object], times: int = 3) -> float:
+def best_of(what: Callable[[], object], times: int = 9) -> float:
     """CPU seconds of the fastest of several calls: with one thread, what an idle machine would take."""
     taken = []
     for _ in range(times):

@@ -1,5 +1,5 @@
 // One arc-length step in the frame of the section at its beginning: where nothing acts in the base frame and the section is round
-// (no tendons, no weight, diagonal stiffness), half the work of section.h's tangents, to the same numbers. March.h walks by it.
+// (no tendons, no weight, diagonal stiffness), half the work of the tangents of section.h, to the same numbers.
 //
 // (1) Within a step from q (|q| = 1) write the orientation of stage i as q e_i. step.py's rate q' = q (u, 0) / 2 is linear in q, and
 //     its R(q e) = R(q) R(e), so that for the classical Runge-Kutta step of length h, with u_i as quaternions of no real part,

@@ -1,0 +1,46 @@
+"""Whole fits by the compiled kernel and by the torch model, on cases that torchrod is measured by: the same loads to 1e-8.
+
+TORCHROD_EVERY=1 takes all of them, which keeps the torch path busy for about ten minutes.
+"""
+
+import os
+from dataclasses import replace
+
+import pytest
+import torch
+from ablations.plans import make, reference_parts
+
+from tests.test_fast import needs_compiler
+from torchrod import cold_start, estimate, fast
+from torchrod.estimator import CHUNK_TORCH
+
+pytestmark = needs_compiler
+# So many samples of a row of docs/warm_start.md; of "reference", draws of noise for every shape of the independent solver.
+EVERY = {"study1_clean": 100, "study1_1mm": 100, "two_contacts": 60, "one_tendon": 40, "two_tendons": 40, "reference": 1}
+SAMPLES = EVERY if os.environ.get("TORCHROD_EVERY") else {"study1_1mm": 20, "two_contacts": 6, "one_tendon": 4}
+
+
+def parts(name: str):
+    if name == "reference":
+        return reference_parts(SAMPLES[name])
+    return [replace(p, markers=p.markers.take(torch.arange(SAMPLES[name]))) for p in make(name, False).parts]
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_both_paths_find_the_same_loads(name, monkeypatch):
+    for part in parts(name):
+        assert len(part.markers.positions) <= CHUNK_TORCH
+        found = []
+        for compiled in (True, False):
+            with monkeypatch.context() as m:
+                if not compiled:
+                    m.setattr(fast, "available", lambda: False)
+                found.append(estimate(part.model, part.markers, part.noise, start=cold_start))
+        one, other = found
+        assert torch.equal(one.status, other.status)
+        assert torch.equal(one.accepted, other.accepted)
+        assert torch.equal(one.iterations, other.iterations)
+        for what in ("force", "location", "base_wrench"):
+            a, b = getattr(one, what), getattr(other, what)
+            scale = b if what == "location" else b.abs().amax(-1, keepdim=True)
+            assert float(((a - b).abs() / scale).max()) < 1e-8, what
