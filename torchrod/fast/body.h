@@ -150,6 +150,7 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
 template <bool Loaded> __attribute__((noinline)) void body_tangent(const Group& g, const BodyStep& b, int64_t j, V* t) {
     V x[4][6], sum[6], z[6];
     for (int c = 0; c < 6; c++) z[c] = t[c], sum[c] = -t[c];
+#pragma GCC unroll 4
     for (int k = 0; k < 4; k++) {
         const BodyStep::Stage& at = b.at[k];
         V* d = x[k];
@@ -167,6 +168,7 @@ template <bool Loaded> __attribute__((noinline)) void body_tangent(const Group& 
     for (int c = 0; c < 6; c++) t[c] = (1.0 / 3) * sum[c] + z[c];
     const V3 theta = part(t + 6);
     V3 dE{}, dP = part(t + 9) + cross(theta, b.P);
+#pragma GCC unroll 4
     for (int k = 0; k < 4; k++) {
         const BodyStep::Stage& at = b.at[k];
         const V3 dN = part(x[k]), dM = part(x[k] + 3);
