@@ -59,6 +59,16 @@ def _count(options: Namespace, robot: Robot) -> int | None:
     return int(contacts)
 
 
+def _check_frame_std(options: Namespace) -> None:
+    shift, turn = options.frame_std
+    positive("--frame-std SHIFT", shift)
+    positive("--frame-std TURN", turn)
+    if not options.registration:
+        raise InputError("--frame-std says how well the base frame is known; give --registration as well")
+    if turn > 1:
+        raise InputError(f"--frame-std TURN is {turn}; it is in radians: 3 degrees are 0.052")
+
+
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
@@ -72,13 +82,16 @@ def estimate(options: Namespace) -> None:
     writable(options.plot, FIGURE_SUFFIXES)
     if options.one_frame and not options.registration:
         raise InputError("--one-frame says that all samples share what --registration estimates; give --registration as well")
+    if options.frame_std is not None:
+        _check_frame_std(options)
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
     def model(k: int, prior: str, tip: str) -> Model:
         coordinates = GaussianCoordinates(k, rod.length, rod.force_scale, prior, locations)
         std = options.tension_std if len(robot.tendons) else None
-        return Model(robot, coordinates, options.registration, steps=options.steps, tip=tip, tension_std=std)
+        frame = tuple(options.frame_std) if options.frame_std else None
+        return Model(robot, coordinates, options.registration, steps=options.steps, tip=tip, tension_std=std, frame_std=frame)
 
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     candidates = _hypotheses(options, count, model)
