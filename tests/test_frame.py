@@ -92,7 +92,7 @@ def test_the_command_line(tmp_path, capsys):
 
 
 def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
-    """4 more markers at s = 0, 200 mm off the axis: within 1.7 of a perfect frame by the plain --registration, as their bound has it."""
+    """4 more markers at s = 0, 200 mm off the axis: within 1.7 of a perfect frame, a shape by itself."""
     study, perfect, moved = shapes(40)
     angle = torch.arange(4) * math.pi / 2
     plate = 0.2 * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from .arguments import FIGURE_SUFFIXES, noise_or_auto, positive, writable
 from .coordinates import GaussianCoordinates
-from .diagnosis import diagnose
+from .diagnosis import ROBUST, diagnose
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
@@ -37,7 +37,6 @@ from .warmstart import WarmStart, find_warm_start
 
 MAX_CONTACTS = 3
 Parts = list[tuple[Model, torch.Tensor]]
-ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 
 
 def _count(options: Namespace, robot: Robot) -> int | None:
@@ -73,7 +72,7 @@ def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot)
-    noise = noise_or_auto(options.noise)
+    noise = noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)
     positive("--steps", options.steps)

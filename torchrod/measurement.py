@@ -242,8 +242,8 @@ class Model:
     def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Mean and precision of every entry of x: the loads' own; weak on tip, 1 on theta, none on alpha, which (17) holds.
 
-        zeta is zero within frame_std, else FRAME_SHIFT and FRAME_TURN: what a base frame is off by after it was once set up. A wider
-        prior lets an unlikely frame pass for a push near the base, a narrower one is worth having (docs/trust.md).
+        zeta is zero within frame_std, else FRAME_SHIFT and FRAME_TURN: what a base frame is off by after it was once set up. A
+        wider prior lets an unlikely frame pass for a push near the base, a narrower one is worth having (docs/trust.md).
         """
         mean, precision = self.coordinates.prior()
         tip = mean.new_full((TIP_UNKNOWNS[self.tip],), TIP_STD**-2)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .estimator import Settings, estimate
+from .estimator import Settings, check, estimate, usable
 from .fit import Evidence
 from .measurement import Markers, Model
 from .probe import probe, start_with_one_more
@@ -103,8 +103,10 @@ def select(
     Loads that the chosen hypothesis does not have are NaN.
 
     start: the rule a model starts by where the residual of an earlier fit suggests nothing. A sample for which nothing converges is
-    reported with the fit that left the smallest chi^2. Errors: ValueError where there are too few markers for the first hypothesis.
+    reported with the fit that left the smallest chi^2. One with too few markers for any load is invalid: it would show none.
+    Errors: ValueError where that is so of the whole file.
     """
+    markers = _that_show_a_load(hypotheses, markers, noise)
     B = len(markers.positions)
     hasty = replace(settings, restarts=())  # a count that is too low fails however it starts
     fit: Estimate | None = None
@@ -138,6 +140,14 @@ def select(
             fit = _replaced(fit, other, index, other.accepted)
             scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
     return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores)
+
+
+def _that_show_a_load(hypotheses: list[Hypothesis], markers: Markers, noise: float) -> Markers:
+    """The markers, without those of samples that have too few for the simplest hypothesis with a load."""
+    loaded = [h.model for h in hypotheses if h.model.load_size]
+    simplest = min(loaded or [hypotheses[0].model], key=lambda model: model.free_size)
+    check(simplest, markers, noise)
+    return replace(markers, positions=markers.positions.where(usable(simplest, markers)[:, None, None], torch.nan))
 
 
 def _explains_better(
