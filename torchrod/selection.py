@@ -111,13 +111,14 @@ def select(
     hasty = replace(settings, restarts=())  # a count that is too low fails however it starts
     fit: Estimate | None = None
     scores = torch.full((B, len(hypotheses)), torch.nan, dtype=torch.float64)
+    foreseen = scores.clone()
     best, choice = torch.full((B,), torch.inf, dtype=torch.float64), torch.zeros(B, dtype=torch.int64)
     fits: dict[str, tuple[Estimate, Int[Tensor, " b"]]] = {}
     for h, hypothesis in enumerate(hypotheses):
         model = hypothesis.model
         if fit is not None and 3 * len(markers.s) < model.free_size:
             continue
-        index, begin = _needed(hypothesis, hypotheses, fits, markers, noise, start(model))
+        index, begin = _needed(hypothesis, hypotheses, fits, markers, noise, start(model), foreseen[:, h])
         if not len(index):
             continue
         part = markers.take(index)
@@ -139,7 +140,7 @@ def select(
             other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
             fit = _replaced(fit, other, index, other.accepted)
             scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
-    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores)
+    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores, foreseen)
 
 
 def _that_show_a_load(hypotheses: list[Hypothesis], markers: Markers, noise: float) -> Markers:
@@ -165,8 +166,12 @@ def _needed(
     markers: Markers,
     noise: float,
     rule: StartRule,
+    foreseen: Float[Tensor, " B"],
 ) -> tuple[Int[Tensor, " b"], StartRule]:
-    """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any."""
+    """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any.
+
+    foreseen: takes the BIC that its score test promises.
+    """
     everyone = torch.arange(len(markers.positions))
     before = [h for h in hypotheses if h.contacts == hypothesis.contacts - 1 and same_kind(h.model, hypothesis.model)]
     if not before:
@@ -179,6 +184,7 @@ def _needed(
     found = probe(model, fitted.x.nan_to_num(0.0), markers.take(index), noise)
     per_load = free_parameters(hypothesis.model) - free_parameters(model)
     asked = per_load * torch.log((3.0 * markers.present[index].sum(-1)).clamp(min=math.e))
+    foreseen[index] = bic(fitted, model, markers.take(index)) - found.drop + asked
     wanted = sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)
     rows = wanted.nonzero().squeeze(-1)
     begin = start_with_one_more(hypothesis.model, found.take(rows))
