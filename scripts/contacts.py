@@ -1,7 +1,7 @@
 """How often --contacts auto finds the right loads: python scripts/contacts.py [--samples N] [--out DIR] writes DIR/contacts.md.
 
-The paper's steel rod, pushes of 0.5 to 2 N at 10 to 39 cm, two of them at least 8 cm apart, 1 mm noise unless said otherwise: how many
-contacts; a contact or something at the tip (--unknown-tip); a contact or a distributed load (--load-prior auto).
+The paper's steel rod, pushes of 0.5 to 2 N at 10 to 39 cm, two of them at least 8 cm apart, 1 mm noise unless said otherwise: how
+many contacts; a contact or something at the tip (--unknown-tip); a contact or a distributed load (--load-prior auto).
 """
 
 import argparse
@@ -18,7 +18,6 @@ from tqdm import tqdm
 
 from torchrod import (
     GaussianCoordinates,
-    Load,
     Markers,
     Model,
     PointForces,
@@ -28,6 +27,7 @@ from torchrod import (
     find_warm_start,
     solve_shape,
 )
+from torchrod.loads import Load
 from torchrod.selection import Hypothesis, select
 
 ROBOT = steel_rod()
@@ -65,7 +65,10 @@ def _loads(truth: Truth, samples: int, generator: torch.Generator) -> tuple[Load
     if truth.tip:
         way = torch.randn(samples, 3, generator=generator, dtype=torch.float64)
         push = (0.5 + 1.5 * _uniform(generator, samples, 1)) * way / way.norm(dim=-1, keepdim=True)
-        loads = (*loads, PointWrenches(push.unsqueeze(1), torch.zeros_like(push).unsqueeze(1), torch.tensor([L])))
+        loads = (
+            *loads,
+            PointWrenches(push.unsqueeze(1), torch.zeros_like(push).unsqueeze(1), torch.tensor([L], dtype=torch.float64)),
+        )
     return loads
 
 

@@ -1,7 +1,8 @@
 """How many loads, and of what kind: the Bayesian information criterion, each sample deciding for itself.
 
 Stage k fits k contacts to the samples that still need it: those that no fit so far explains, and those whose residual asks for one
-more load by the score test of torchrod.probe, from which its fit starts.
+more load by the score test of torchrod.probe, from which its fit starts. Where something at the tip competes, there is a way back:
+a fit with fewer loads may only have been led astray, so it is tried again from the one that was chosen, without one of its loads.
 """
 
 import math
@@ -133,14 +134,80 @@ def select(
         fit = _replaced(fit, other, index, lower)
         best[index[lower]], choice[index[lower]] = scores[index[lower], h], h
     assert fit is not None
+    fit = _simplified(hypotheses, fit, choice, scores, markers, noise, hasty)
+    if settings.restarts:
+        fit = _tried_again(hypotheses, fit, choice, scores, markers, noise, settings, start)
+    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores, foreseen)
+
+
+def _simplified(
+    hypotheses: list[Hypothesis],
+    fit: Estimate,
+    choice: Int[Tensor, " B"],
+    scores: Float[Tensor, "B H"],
+    markers: Markers,
+    noise: float,
+    settings: Settings,
+) -> Estimate:
+    """The fit on the way back; choice and scores change with it."""
+    for more, fewer, dropped in _ways_back(hypotheses):
+        index = ((choice == more) & fit.accepted).nonzero().squeeze(-1)
+        if not len(index):
+            continue
+        model, part = hypotheses[fewer].model, markers.take(index)
+        x = _with_one_less(fit.x[index], hypotheses[more].model, model, dropped)
+        other = estimate(model, part, noise, settings, _from(Start(x, None, torch.ones_like(index, dtype=torch.bool))))
+        again = bic(other, model, part)
+        lower = again < scores[index, more]
+        fit = _replaced(fit, other, index, lower)
+        scores[index[lower], fewer], choice[index[lower]] = again[lower], fewer
+    return fit
+
+
+def _tried_again(
+    hypotheses: list[Hypothesis],
+    fit: Estimate,
+    choice: Int[Tensor, " B"],
+    scores: Float[Tensor, "B H"],
+    markers: Markers,
+    noise: float,
+    settings: Settings,
+    start: Callable[[Model], StartRule],
+) -> Estimate:
+    """The fit with restarts of the chosen hypothesis where that explains nothing; scores change with it."""
     for h, hypothesis in enumerate(hypotheses):
         index = ((choice == h) & ~fit.accepted & torch.isfinite(fit.x[:, -1])).nonzero().squeeze(-1)
-        if len(index) and settings.restarts:
-            part = markers.take(index)
-            other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
-            fit = _replaced(fit, other, index, other.accepted)
-            scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
-    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores, foreseen)
+        if not len(index):
+            continue
+        part = markers.take(index)
+        other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
+        fit = _replaced(fit, other, index, other.accepted)
+        scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
+    return fit
+
+
+def _ways_back(hypotheses: list[Hypothesis]) -> list[tuple[int, int, int]]:
+    """Where something at the tip competes: a hypothesis, one with a contact less, and which contact to leave out; the most first.
+
+    Numbers of contacts alone are not worth it: there a fit with too few loads that explains nothing is nearly always what it seems.
+    """
+    if len({h.model.tip for h in hypotheses}) < 2:
+        return []
+    found = []
+    for more, a in reversed(list(enumerate(hypotheses))):
+        for fewer, b in enumerate(hypotheses):
+            kept = same_kind(a.model, b.model) or (b.model.tip != "none" and same_kind(a.model, replace(b.model, tip="none")))
+            if a.contacts > 1 and b.contacts == a.contacts - 1 and kept:
+                found += [(more, fewer, dropped) for dropped in range(a.contacts)]
+    return found
+
+
+def _with_one_less(x: Float[Tensor, "b m"], more: Model, fewer: Model, dropped: int) -> Float[Tensor, "b n"]:
+    """A start for `fewer`: the state of `more` without one of its loads; what acts on the tip, if that is new, is still nothing."""
+    g, n = more.coordinates.size, fewer.coordinates.size
+    kept = torch.cat([x[:, : (g - n) * dropped], x[:, (g - n) * (dropped + 1) : g]], -1)
+    tip = x[:, g : more.load_size] if more.tip == fewer.tip else x.new_zeros(len(x), fewer.load_size - n)
+    return torch.cat([kept, tip, x[:, more.load_size : more.size]], -1)
 
 
 def _that_show_a_load(hypotheses: list[Hypothesis], markers: Markers, noise: float) -> Markers:
