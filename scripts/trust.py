@@ -19,7 +19,7 @@ def main() -> None:
         "--samples",
         type=int,
         default=1000,
-        help="runs per row; missing markers take four times as many, the noise a fifth, the base frame a tenth, mistakes a 25th",
+        help="runs per row; missing markers take four times as many, the base frame two fifths, the noise a fifth, mistakes a 25th",
     )
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
@@ -36,7 +36,7 @@ def main() -> None:
         markers.run(options.samples),
         unknown_noise.run(max(options.samples // 5, 4)),
         mistakes.run(max(options.samples // 25, 4)),
-        frame.run(max(options.samples // 10, 5), right),
+        frame.run(max(2 * options.samples // 5, 5), right),
     ):
         lines += [*part, ""]
         print("\n".join(part), flush=True)

@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +12,7 @@ from tests.conftest import reference
 from tests.robots import toml_of
 from torchrod import Markers
 from torchrod.cli import main
-from torchrod.geometry import misplaced, unit_hint
+from torchrod.geometry import misplaced, too_far, unit_hint
 
 CASE = next(c for c in reference("shape") if c["name"] == "passive-point-1")
 GOOD = [[s, *p] for s, p in zip(CASE["s"], CASE["positions"], strict=True)]
@@ -29,10 +30,19 @@ WRONG = {
     "s too small": ([[1e-3 * s, x, y, z] for s, x, y, z in GOOD], "give the arc lengths s in metres"),
     "from the tip": ([[GOOD[LAST - i][0], *row[1:]] for i, row in enumerate(GOOD)][::-1], "count s from the base to the tip"),
     "other origin": ([[s, x + 0.3, y, z] for s, x, y, z in GOOD], "whose origin is where the rod leaves the base"),
+    "inches": ([[s, 39.37 * x, 39.37 * y, 39.37 * z] for s, x, y, z in GOOD], "are they in inches? give metres"),
+    "one in millimetres": (
+        [[s, 1e3 * x, 1e3 * y, 1e3 * z] if i == 7 else [s, x, y, z] for i, (s, x, y, z) in enumerate(GOOD)],
+        f"(s = {1e3 * GOOD[7][0]:.4g} mm): up to 155 m from the others",
+    ),
 }
 REFUSED = {
     "millimetres": (WRONG["millimetres"][0], "on a rod of 0.4 m; are they in millimetres? give metres"),
     "s in millimetres": ([[1e3 * row[0], *row[1:]] for row in GOOD], "is it in millimetres? give metres"),
+    "s in kilometres": ([[1e-3 * row[0], *row[1:]] for row in GOOD], "the markers end at s = 0.0004 m of a rod of 0.4 m"),
+    "all in kilometres": ([[1e-3 * v for v in row] for row in GOOD], "are the file and the robot's length in the same unit?"),
+    "camera frame": ([[s, x + 1.5, y, z] for s, x, y, z in GOOD], "the unit fits, so give them in the robot's base frame"),
+    "camera frame, millimetres": ([[s, 1e3 * x - 900, 1e3 * y, 1e3 * z + 700] for s, x, y, z in GOOD], "are they in millimetres?"),
     "the same s twice": ([*GOOD[:5], GOOD[4], *GOOD[5:]], "two markers at s = 0.1 m; keep one"),
     "one marker": (GOOD[9:10], "1 marker cannot determine 4 unknowns; add markers"),
 }
@@ -85,3 +95,45 @@ def test_a_bent_rod_is_not_misplaced():
         for b in (0, 1):
             assert misplaced(markers, b, case["robot"]["length"]) == "", case["name"]
     assert "another unit or frame" in unit_hint(1e7)
+
+
+def test_the_unit_is_told_however_the_rod_is_bent():
+    """Every reference shape in every unit: by the distance of neighbours, so that a rod bent into its own base is told as well."""
+    for case in reference("shape"):
+        z, s = torch.tensor([case["positions"]]), torch.tensor(case["s"])
+        for factor, name in ((1e6, "micrometres"), (1e3, "millimetres"), (1e2, "centimetres"), (39.37, "inches")):
+            assert f"are they in {name}?" in too_far(Markers(s, factor * z), case["robot"]["length"]), case["name"]
+        assert too_far(Markers(s, z), case["robot"]["length"]) == ""
+
+
+@pytest.mark.parametrize("options", [["--contacts", "2"], ["--contacts", "auto"], ["--contacts", "auto", "--noise", "auto"]])
+def test_too_few_markers_are_invalid_and_the_rest_go_on(tmp_path, options):
+    """No marker, and one that has been moved: no count of contacts and no noise can be told from them, auto or not."""
+    one = [row if i == LAST else [row[0], "", "", ""] for i, row in enumerate(GOOD)]
+    out = tmp_path / "result.json"
+    files = write(tmp_path, {"good": GOOD, "none": WRONG["no marker"][0], "one": one})
+    assert main(["estimate", *files, *options, "--out", str(out)]) == 0
+    good, *rest = json.loads(out.read_text())["results"]
+    assert good["status"] == "converged"
+    assert good["accepted"]
+    for record, words in zip(rest, ("No marker was seen", "Only one marker was seen"), strict=True):
+        assert record["status"] == "invalid"
+        assert not record["accepted"]
+        assert words in record["message"]
+
+
+@pytest.mark.parametrize("options", [[], ["--contacts", "auto"]])
+def test_npz_is_refused_as_csv_is(tmp_path, capsys, options):
+    (tmp_path / "robot.toml").write_text(toml_of(CASE["robot"], "rod"))
+    for name, (rows, words) in REFUSED.items():
+        s, p = np.array([row[0] for row in rows]), np.array([[row[1:] for row in rows]])
+        np.savez(tmp_path / "shapes.npz", s=s, positions=p)
+        assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.npz"), *options]) == 2, name
+        captured = capsys.readouterr()
+        assert words in captured.err
+        assert captured.err.count("\n") == 1
+
+
+def test_noise_in_millimetres_is_refused(tmp_path, capsys):
+    assert main(["estimate", *write(tmp_path, {"0": GOOD}), "--noise", "0.5"]) == 2
+    assert "it is in metres: 1 mm is 1e-3" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import json
 import math
 
+import pytest
 import roma
 import torch
 
@@ -139,3 +140,20 @@ def test_the_command_line_tells(tmp_path, capsys):
         assert "try --registration" in moved["message"]
         assert moved["suspect_markers"] == unhurt["suspect_markers"] == []
         assert unhurt["message"] == "Converged."
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_outliers_are_named_where_nothing_else_explains_the_markers(count):
+    """2 of 20 markers 50 mm off, in every other sample: those two are told, and none of clean markers."""
+    markers = noisy(8)
+    positions = markers.positions.clone()
+    positions[::2, 6, 0] += 0.05
+    positions[::2, 13, 1] -= 0.05
+    model, off = model_of(steel_rod(), count), Markers(markers.s, positions)
+    fit = estimate(model, off, 1e-3)
+    diagnosis = diagnose([(model, torch.arange(8))], off, 1e-3, fit)
+    assert diagnosis.outliers == ((6, 13), ()) * 4
+    assert "Markers 7 and 14 (s = 140 and 280 mm) look like outliers; try --robust." in diagnosis.message(0)
+    assert [group["suspicion"] for group in diagnosis.suspects(0)] == ["outlier", "outlier"]
+    robust = Settings(robust=10.0)
+    assert diagnose([(model, torch.arange(8))], off, 1e-3, estimate(model, off, 1e-3, robust), robust).outliers == ((),) * 8

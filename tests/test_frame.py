@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import roma
 import torch
@@ -88,3 +89,45 @@ def test_the_command_line(tmp_path, capsys):
     capsys.readouterr()
     assert main(["estimate", *files, "--one-frame"]) == 2
     assert "give --registration as well" in capsys.readouterr().err
+
+
+def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
+    """4 more markers at s = 0, 200 mm off the axis: within 1.7 of a perfect frame, a shape by itself."""
+    study, perfect, moved = shapes(40)
+    angle = torch.arange(4) * math.pi / 2
+    plate = 0.2 * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
+    noise = 1e-3 * torch.randn(40, 4, 3, generator=torch.Generator().manual_seed(3))
+    seen = plate @ roma.rotvec_to_rotmat(TURN).T + SHIFT + noise
+    offsets = torch.cat([plate, plate.new_zeros(len(study.s), 3)])
+    both = Markers(torch.cat([plate.new_zeros(4), study.s]), torch.cat([seen, moved.positions], 1), offsets)
+    apart = model_of(study, True)
+    fits = [estimate(model_of(study, False), perfect, 1e-3), estimate(apart, both, 1e-3), estimate(apart, moved, 1e-3)]
+    for what, truth in (("location", study.location), ("magnitude", study.force.norm(dim=-1))):
+        best, with_plate, without = (float((getattr(fit, what)[:, 0] - truth).abs().mean()) for fit in fits)
+        assert with_plate < 1.7 * best, what
+        assert without > 1.5 * with_plate, what
+
+
+def test_a_frame_that_is_known_better(tmp_path, capsys):
+    """--frame-std: the prior of a registration; a frame that is known to 0.01 mm stays where it is."""
+    study, _, moved = shapes(1)
+    prior = [replace(model_of(study, True), frame_std=std).prior()[1][-12:-6] for std in (None, (2e-3, 0.01))]
+    assert torch.allclose(prior[1] / prior[0], T([100.0] * 3 + [17.5**2] * 3))
+    (tmp_path / "robot.toml").write_text(ROD)
+    write_shapes(tmp_path / "shapes.csv", Shapes(moved, ["0"]))
+    command = ["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), "--out", str(tmp_path / "result.json")]
+    shifts = []
+    for options in ([], ["--frame-std", "1e-5", "1e-5"]):
+        assert main([*command, "--registration", *options]) == 0
+        (record,) = json.loads((tmp_path / "result.json").read_text())["results"]
+        shifts.append(T(record["registration"]["translation_m"]).norm())
+    assert shifts[0] > 3e-3
+    assert shifts[1] < 1e-4
+    capsys.readouterr()
+    for options, words in (
+        (["--frame-std", "1e-3", "0.05"], "give --registration as well"),
+        (["--registration", "--frame-std", "1e-3", "3"], "in radians: 3 degrees are 0.052"),
+        (["--registration", "--frame-std", "0", "0.05"], "must be a positive number"),
+    ):
+        assert main([*command, *options]) == 2
+        assert words in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import json
 import math
 
+import contacts
 import pytest
 import torch
 
@@ -71,6 +72,9 @@ def test_the_count_is_found_and_its_evidence_told(contacts, tmp_path):
         assert len(sample["loads"]) == contacts
         known = {name: bic for name, bic in sample["evidence"]["bic"].items() if bic is not None}
         assert min(known, key=lambda name: known[name]) == str(contacts)
+        foreseen = sample["evidence"]["bic_foreseen"]
+        assert sorted([*known, *foreseen, *sample["evidence"]["not_converged"]]) == ["0", "1", "2", "3"]
+        assert foreseen.get(str(contacts + 1), math.inf) > known[str(contacts)], "why one more was not needed"
         for load, (x, y, s) in zip(sorted(sample["loads"], key=lambda v: v["location_m"]), FORCES[contacts], strict=True):
             assert abs(load["location_m"] - s) < 0.03
             assert abs(load["magnitude_N"] - math.hypot(x, y)) < 0.4
@@ -99,3 +103,12 @@ def test_a_wide_load_is_told_from_a_contact(tmp_path):
     for loads, prior in ((wide, "distributed"), (pushes(1), "contact")):
         for sample in run(tmp_path, markers_of(loads, 3, 6, 5e-5), "--load-prior", "auto", "--noise", "5e-5"):
             assert sample["evidence"]["chosen"] == f"1 {prior}"
+
+
+def test_a_contact_and_a_push_at_the_tip_are_told_from_two_contacts_and_a_push(tmp_path):
+    """Pushes along the rod beyond its buckling load: the stages alone end at "2 + tip force" in these (docs/contacts.md)."""
+    truth = contacts.Truth(1, tip=True)
+    markers = contacts.cases(truth, 20, 24, 5003, 2e-4)
+    results = run(tmp_path, markers, "--contacts", "auto", "--unknown-tip", "force", "--noise", "2e-4")
+    right = [sample["evidence"]["chosen"] == "1 + tip force" for sample in results]
+    assert sum(right) >= 20

@@ -15,8 +15,9 @@ def test_coverage_of_a_contact():
 
 def test_mistakes_are_told():
     rows = {row.name: row for row in mistakes.ROWS}
-    assert list(mistakes.measured(rows["nothing wrong"], 10, 1)) == [10, 0, 0, 0, 0, 0]
-    assert list(mistakes.measured(rows["one pair exchanged"], 6, 2)) == [0, 6, 0, 0, 0, 0]
+    assert list(mistakes.measured(rows["nothing wrong"], 10, 1)) == [10, 0, 0, 0, 0, 0, 0, 0]
+    assert list(mistakes.measured(rows["one pair exchanged"], 6, 2)) == [0, 6, 0, 0, 0, 0, 0, 0]
+    assert list(mistakes.measured(rows["2 markers 50 mm off"], 6, 3)) == [0, 0, 0, 6, 0, 0, 0, 0]
 
 
 def test_one_frame_for_many_shapes():

@@ -6,6 +6,7 @@ from pathlib import Path
 from .errors import InputError
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+COARSEST = 0.25  # of the length: with more noise no shape shows
 
 
 def positive(name: str, value: float) -> None:
@@ -26,8 +27,8 @@ def writable(path: str | None, suffixes: tuple[str, ...]) -> None:
         raise InputError(f"{path}: is a folder; give a file name")
 
 
-def noise_or_auto(value: str) -> float | None:
-    """A standard deviation of the markers (m); None for auto."""
+def noise_or_auto(value: str, length: float) -> float | None:
+    """A standard deviation of the markers (m) on a rod of this length (m); None for auto."""
     if value == "auto":
         return None
     try:
@@ -35,6 +36,8 @@ def noise_or_auto(value: str) -> float | None:
     except ValueError:
         raise InputError(f"--noise is {value}; it must be auto or a standard deviation in metres") from None
     noise_std(number)
+    if number > COARSEST * length:
+        raise InputError(f"--noise is {value} m on a rod of {length:g} m; it is in metres: 1 mm is 1e-3")
     return number
 
 

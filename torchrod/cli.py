@@ -42,6 +42,9 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
     parser.add_argument("--one-frame", action="store_true", help="with --registration: it is the same in all samples")
+    _number_list(
+        parser, "--frame-std", "with --registration: SHIFT TURN (m, rad), std of the error; 5 %% of the length, 10 degrees", 2
+    )
     parser.add_argument(
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
     )

@@ -1,4 +1,4 @@
-"""Why does a fit not explain its markers? Labels exchanged, a base frame that is off, a load too few, the unit. It only tells.
+"""Why does a fit not explain its markers? Labels exchanged, a base frame off, a load too few, the unit, outliers. It only tells.
 
 A rod of arc length s_j - s_i between two markers holds them no farther apart than that, whatever bends it (r: their offsets from
 the centre line):
@@ -11,6 +11,7 @@ speaks for the exchange. (1) finds them where the fit itself was led astray, the
 markers closer together than a few standard deviations. The fit that is reported is never changed.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -31,6 +32,8 @@ LOWERED = 0.5  # an exchange must halve what it is tried for, and chi^2, to be t
 TRANSLATION, ROTATION = 0.1, 0.35  # of the length, and rad: a base frame that is farther off than that is another mistake
 SURE = 10.0  # BIC: by so much a base frame must do better before it speaks against a fit that is accepted
 ITERATIONS = 60
+ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
+FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
 CHUNK = 64  # samples at a time: the table of exchanges holds (markers)^3 numbers of each while it is made
 
 
@@ -40,7 +43,8 @@ class Diagnosis:
 
     s: (P,) m, of the markers. exchanged: per sample the groups of markers (counted from 0) whose labels look exchanged, mostly
     pairs. registration: (B, 6) [m, rad], an error of the base frame that explains the markers; NaN where none does. one_more: (B,),
-    where one more load does. geometry: per sample what is wrong with its markers' unit, frame or order, or nothing.
+    where one more load does. geometry: per sample what is wrong with its markers' unit, frame or order, or nothing. outliers: per
+    sample the markers without which a robust fit explains the others.
     """
 
     s: Float[Tensor, " P"]
@@ -48,21 +52,25 @@ class Diagnosis:
     registration: Float[Tensor, "B 6"]
     one_more: Bool[Tensor, " B"]
     geometry: tuple[str, ...]
+    outliers: tuple[Cycle, ...]
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
         """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
         s = self.s.tolist()
-        return [
-            {"markers": [i + 1 for i in cycle], "s_m": [s[i] for i in cycle], "suspicion": "exchanged"}
-            for cycle in self.exchanged[sample]
-        ]
+        groups = [(cycle, "exchanged") for cycle in self.exchanged[sample]] + [((i,), "outlier") for i in self.outliers[sample]]
+        return [{"markers": [i + 1 for i in group], "s_m": [s[i] for i in group], "suspicion": what} for group, what in groups]
+
+    def _named(self, markers: Cycle) -> str:
+        names, places = _listed([str(i + 1) for i in markers]), _listed([f"{1e3 * float(self.s[i]):.4g}" for i in markers])
+        return f"Marker{'s' * (len(markers) > 1)} {names} (s = {places} mm)"
 
     def message(self, sample: int) -> str:
         """Sentences with the remedy, or nothing."""
         said = []
         for cycle in self.exchanged[sample]:
-            names, places = _listed([str(i + 1) for i in cycle]), _listed([f"{1e3 * float(self.s[i]):.4g}" for i in cycle])
-            said.append(f"Markers {names} (s = {places} mm) look exchanged; exchange their labels.")
+            said.append(f"{self._named(cycle)} look exchanged; exchange their labels.")
+        if off := self.outliers[sample]:
+            said.append(f"{self._named(off)} look{' like outliers' if off[1:] else 's like an outlier'}; try --robust.")
         zeta = self.registration[sample]
         if bool(torch.isfinite(zeta).all()):
             shift, turn = 1e3 * float(zeta[:3].norm()), float(zeta[3:].norm().rad2deg())
@@ -78,7 +86,7 @@ class Diagnosis:
 
 
 def _listed(words: list[str]) -> str:
-    return f"{', '.join(words[:-1])} and {words[-1]}"
+    return f"{', '.join(words[:-1])} and {words[-1]}" if words[1:] else words[0]
 
 
 def _stretch(markers: Markers, z: Float[Tensor, "b P 3"]) -> Float[Tensor, "b P P"]:
@@ -213,6 +221,16 @@ def _explained(
     return torch.where(framed.unsqueeze(-1), zeta, torch.nan), torch.isfinite(best) & ~framed & (by_load == best)
 
 
+def _outliers(model: Model, markers: Markers, noise: float, settings: Settings) -> list[Cycle]:
+    """Per sample the few markers far off without which a robust fit explains the others."""
+    if math.isfinite(settings.robust) or not len(markers.positions):
+        return [()] * len(markers.positions)
+    fit = estimate(model, markers, noise, replace(settings, robust=ROBUST))
+    few = fit.outlier.sum(-1) <= FEW * markers.present.sum(-1)
+    told = fit.outlier & (fit.residual.norm(dim=-1) > CLEAR * noise) & (fit.accepted & few).unsqueeze(-1)
+    return [tuple(row.nonzero().flatten().tolist()) for row in told]
+
+
 def diagnose(
     parts: Sequence[tuple[Model, Int[Tensor, " b"]]],
     markers: Markers,
@@ -230,8 +248,10 @@ def diagnose(
     exchanged: list[tuple[Cycle, ...]] = [()] * len(fit.status)
     registration = torch.full((len(fit.status), 6), torch.nan, dtype=torch.float64)
     one_more, geometry = torch.zeros(len(fit.status), dtype=torch.bool), [""] * len(fit.status)
+    outliers: list[Cycle] = [()] * len(fit.status)
     for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():
         geometry[b] = misplaced(markers, b, parts[0][0].robot.rod.length)
+    richest = [model for model, _ in parts if 3 * len(markers.s) >= model.free_size][-1]
     for model, index in parts:
         chosen = len(parts) > 1 and model.load_size > 4
         doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & usable(model, markers.take(index))
@@ -246,4 +266,7 @@ def diagnose(
             part, n = markers.take(rest), 3.0 * markers.present[rest].sum(-1)
             own = _bic(fit.accepted[rest], fit.chi2[rest], model, n)
             registration[rest], one_more[rest] = _explained(model, part, noise, own, hasty)
-    return Diagnosis(markers.s, tuple(exchanged), registration, one_more, tuple(geometry))
+            rest = rest[~fit.accepted[rest] & ~one_more[rest] & registration[rest].isnan().any(-1)]
+            for b, off in zip(rest.tolist(), _outliers(richest, markers.take(rest), noise, settings or Settings()), strict=True):
+                outliers[b] = off
+    return Diagnosis(markers.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers))

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from .arguments import FIGURE_SUFFIXES, noise_or_auto, positive, writable
 from .coordinates import GaussianCoordinates
-from .diagnosis import diagnose
+from .diagnosis import ROBUST, diagnose
 from .errors import InputError
 from .estimator import Settings
 from .estimator import estimate as run_estimate
@@ -37,7 +37,6 @@ from .warmstart import WarmStart, find_warm_start
 
 MAX_CONTACTS = 3
 Parts = list[tuple[Model, torch.Tensor]]
-ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 
 
 def _count(options: Namespace, robot: Robot) -> int | None:
@@ -59,11 +58,21 @@ def _count(options: Namespace, robot: Robot) -> int | None:
     return int(contacts)
 
 
+def _check_frame_std(options: Namespace) -> None:
+    shift, turn = options.frame_std
+    positive("--frame-std SHIFT", shift)
+    positive("--frame-std TURN", turn)
+    if not options.registration:
+        raise InputError("--frame-std says how well the base frame is known; give --registration as well")
+    if turn > 1:
+        raise InputError(f"--frame-std TURN is {turn}; it is in radians: 3 degrees are 0.052")
+
+
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot)
-    noise = noise_or_auto(options.noise)
+    noise = noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)
     positive("--steps", options.steps)
@@ -72,13 +81,16 @@ def estimate(options: Namespace) -> None:
     writable(options.plot, FIGURE_SUFFIXES)
     if options.one_frame and not options.registration:
         raise InputError("--one-frame says that all samples share what --registration estimates; give --registration as well")
+    if options.frame_std is not None:
+        _check_frame_std(options)
     count = _count(options, robot)
     rod, locations = robot.rod, tuple(options.location) if options.location else None
 
     def model(k: int, prior: str, tip: str) -> Model:
         coordinates = GaussianCoordinates(k, rod.length, rod.force_scale, prior, locations)
         std = options.tension_std if len(robot.tendons) else None
-        return Model(robot, coordinates, options.registration, steps=options.steps, tip=tip, tension_std=std)
+        frame = tuple(options.frame_std) if options.frame_std else None
+        return Model(robot, coordinates, options.registration, steps=options.steps, tip=tip, tension_std=std, frame_std=frame)
 
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     candidates = _hypotheses(options, count, model)

@@ -15,12 +15,14 @@ from .profile import Profile
 class Evidence:
     """What speaks for each hypothesis: names (H); bic (B, H), chi^2 + k ln(n), of which the least is chosen; choice (B,), an index.
 
-    NaN where a hypothesis was not needed, inf where its fit did not converge.
+    NaN where a hypothesis was not needed, inf where its fit did not converge. foreseen (B, H): the BIC that the score test of the
+    fit with one load less promises, to first order, by which a hypothesis was needed or not; NaN where there is no such fit.
     """
 
     names: tuple[str, ...]
     choice: Int[Tensor, " B"]
     bic: Float[Tensor, "B H"]
+    foreseen: Float[Tensor, "B H"]
 
 
 @dataclass(frozen=True)

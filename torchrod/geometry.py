@@ -3,13 +3,15 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .measurement import Markers
 
-UNITS = {1e3: "millimetres", 1e2: "centimetres"}
+UNITS = {1e6: "micrometres", 1e3: "millimetres", 1e2: "centimetres", 39.37: "inches"}
+ALIKE = 1.5  # a ratio is that of a unit within this factor
 FAR, SMALL = 3.0, 0.3  # of the length between the markers along the rod: in another unit, or not a rod
+SHORT = 0.01  # of the rod: where all markers lie nearer to its base, arc lengths and rod are in different units
 OFF = 0.1  # rod lengths: a marker that is so much farther from the origin than along the rod is in another frame
 NEAR_BASE = 0.3  # of the length: the markers that say which way the rod leaves the base
 AXES = [(sign, axis, f"{'+' if sign > 0 else '-'}{'xyz'[axis]}") for axis in range(3) for sign in (1.0, -1.0)]
@@ -17,9 +19,42 @@ ASIDE = 0.87  # cosine of 30 degrees: so near an axis, the shape follows that on
 
 
 def unit_hint(ratio: float) -> str:
-    """A question, where lengths are this many times too large."""
-    unit = next((name for factor, name in UNITS.items() if factor / FAR < ratio < factor * FAR), "another unit or frame")
+    """A question, where markers are this many times farther apart in space than along the rod."""
+    if 1 / ALIKE < ratio < ALIKE:
+        return "the unit fits, so give them in the robot's base frame, whose origin is where the rod leaves the base"
+    unit = next((name for factor, name in UNITS.items() if factor / ALIKE < ratio < factor * ALIKE), "another unit or frame")
     return f"are they in {unit}? give metres in the robot's base frame"
+
+
+def _scale(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float) -> float:
+    """How many times farther apart neighbouring markers are in space than along the rod: 1 in metres, in whatever frame.
+
+    The middle one of all neighbours: a marker that is off does not count. Without neighbours, their distance in rod lengths.
+    """
+    along = s.diff()
+    steps = (z.diff(dim=0).norm(dim=-1) / along)[along > 0]
+    return float(steps.median()) if len(steps) else float(z.abs().max()) / length
+
+
+def too_far(markers: Markers, length: float) -> str:
+    """What to say of a file of which even the nearest sample (its middle marker) is FAR rod lengths (m) off; mostly nothing."""
+    reach = markers.positions.abs().amax(-1).nanmedian(-1).values.nan_to_num(torch.inf)
+    if not len(reach) or not FAR * length < float(reach.min()) < math.inf:
+        return ""
+    nearest = int(reach.argmin())
+    seen = markers.present[nearest]
+    hint = unit_hint(_scale(markers.positions[nearest][seen], markers.s[seen], length))
+    return f"positions reach {float(reach.min()):.3g} m on a rod of {length:g} m; {hint}"
+
+
+def too_short(s: Float[Tensor, " P"], length: float) -> str:
+    """What to say of arc lengths (m) that all lie next to the base; mostly nothing."""
+    if not len(s) or float(s.max()) >= SHORT * length:
+        return ""
+    return (
+        f"the markers end at s = {float(s.max()):.3g} m of a rod of {length:g} m, where no load shows; "
+        "are the file and the robot's length in the same unit? give metres"
+    )
 
 
 def misplaced(markers: Markers, sample: int, length: float) -> str:
@@ -31,22 +66,40 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
     if len(s) == 1:
         return "Only one marker was seen: a contact needs at least two."
     slack = OFF * length if markers.offsets is None else OFF * length + float(markers.offsets.norm(dim=-1).max())
-    size = float(z.abs().max())
+    size, scale = float(z.abs().max()), _scale(z, s, length)
     spans, along = float(z.diff(dim=0).norm(dim=-1).sum()), float(s[-1] - s[0])
-    ratio = spans / along if along > 0 else size / length
-    if ratio > FAR and size > FAR * length:
-        return f"Positions reach {size:.3g} m on a rod of {length:g} m: {unit_hint(ratio)}."
-    if along > 0 and float((z.diff(dim=0).norm(dim=-1) / s.diff()).median()) > min(UNITS) / FAR:
+    if scale > FAR and size > FAR * length:
+        return f"Positions reach {size:.3g} m on a rod of {length:g} m: {unit_hint(scale)}."
+    if along > 0 and scale > min(UNITS) / ALIKE:
         return f"Markers {spans:.3g} m apart in space lie {along:.2g} m apart along the rod: give the arc lengths s in metres."
-    if along > 0 and ratio < SMALL and spans + slack < along:
+    if along > 0 and scale < SMALL and spans + slack < along:
         return (
             f"Markers {along:.3g} m apart along the rod lie {spans:.2g} m apart in space: "
             "give positions in metres, and check the arc lengths s."
         )
+    return _strayed(z, seen, markers.s, length) or _turned(z, s, length, slack)
+
+
+def _strayed(z: Float[Tensor, "p 3"], seen: Bool[Tensor, " P"], s: Float[Tensor, " P"], length: float) -> str:
+    """The markers that are no part of a rod of this length, where the others are."""
+    off = (z - z.median(dim=0).values).abs().amax(-1)
+    stray = (off > FAR * length).nonzero().flatten()
+    if not 0 < 2 * len(stray) < len(z):
+        return ""
+    which = seen.nonzero().flatten()[stray].tolist()
+    names = ", ".join(f"{i + 1} (s = {1e3 * float(s[i]):.4g} mm)" for i in which)
+    return (
+        f"Marker{'s' * (len(which) > 1)} {names}: up to {float(off.max()):.3g} m from the others, on a rod of {length:g} m; "
+        "leave the cells empty, or try --robust."
+    )
+
+
+def _turned(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float, slack: float) -> str:
+    """What is wrong with the order along the rod, or the frame."""
     far = z.norm(dim=-1)
     if bool((far > s + slack).any()) and bool((far <= length - s + slack).all()):
         return "The marker of largest s is the nearest to the base: count s from the base to the tip."
-    if float(far[0] - s[0]) > slack:
+    if float((far - s)[:2].min()) > slack:  # of two: one alone may be an outlier
         return (
             f"The marker at s = {float(s[0]):.3g} m lies {float(far[0]):.3g} m from the origin: "
             "give positions in the robot's base frame, whose origin is where the rod leaves the base."
@@ -65,10 +118,3 @@ def _leaves(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float) -> s
         if name != "+z" and float(sign * way[axis]) > ASIDE:
             return f"The shape leaves the base along {name}, but the rod leaves it along +z: turn the base frame."
     return ""
-
-
-def nearest_reach(positions: Float[Tensor, "B P 3"], length: float) -> float:
-    """How far the markers of the sample that is nearest lie from the base, in rod lengths (its median marker); 0 without any."""
-    reach = positions.abs().amax(-1).nanmedian(-1).values / length
-    reach = reach[~torch.isnan(reach)]
-    return float(reach.min()) if len(reach) else 0.0

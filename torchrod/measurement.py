@@ -30,7 +30,7 @@ TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
 TIP_EXACT = 10.0  # the covariance of the result takes the tip residual as this much stiffer
 TIP_UNKNOWNS = {"none": 0, "force": 3, "wrench": 6}
 TIP_STD = 10.0  # of the weak prior on the unknown tip force and moment about zero, in force and moment scales
-FRAME_SHIFT, FRAME_TURN = 0.05, 0.175  # of the length, and rad (10 degrees): standard deviations of the prior on a registration
+FRAME_SHIFT, FRAME_TURN = 0.05, 0.175  # of the length, and rad (10 degrees): where nothing better is known of a base frame
 TURN_SCALE = 0.1  # rad, one unit of a registration angle; a unit of translation is this part of the rod's length
 
 
@@ -68,6 +68,8 @@ class Model:
     tip: "none", or the unknown dead "force" or "wrench" at the tip, in the base frame. It is known to the markers through the base
     wrench alone, so it costs no tangent of the march.
     tension_std: standard deviation (N) of the sensors of the tensions, which are then part of the state; None takes them as exact.
+    frame_std: standard deviations (m, rad) of a component of the base frame's error, where they are better known than FRAME_SHIFT
+    and FRAME_TURN say.
     """
 
     robot: Robot
@@ -77,6 +79,7 @@ class Model:
     steps: int = DEFAULT_STEPS
     tip: str = "none"
     tension_std: float | None = None
+    frame_std: tuple[float, float] | None = None
 
     @property
     def tension_size(self) -> int:
@@ -245,12 +248,13 @@ class Model:
     def _prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """The loads' own; weak on tip, 1 on theta, none on alpha, which (17) holds.
 
-        zeta is zero within FRAME_SHIFT and FRAME_TURN: what a base frame is off by after it was once set up. A wider prior lets an
-        unlikely frame pass for a push near the base: the error of the magnitude in Study 1 is half as large again (docs/trust.md).
+        zeta is zero within frame_std, else FRAME_SHIFT and FRAME_TURN: what a base frame is off by after it was once set up. A
+        wider prior lets an unlikely frame pass for a push near the base, a narrower one is worth having (docs/trust.md).
         """
         mean, precision = self.coordinates.prior()
         tip = mean.new_full((TIP_UNKNOWNS[self.tip],), TIP_STD**-2)
-        off = mean.new_tensor([FRAME_SHIFT * self.robot.rod.length] * 3 + [FRAME_TURN] * 3)
+        shift, turn = self.frame_std or (FRAME_SHIFT * self.robot.rod.length, FRAME_TURN)
+        off = mean.new_tensor([shift] * 3 + [turn] * 3)
         zeta = (self.zeta_scale(mean) / off) ** 2 if self.registration else mean[:0]
         held = torch.cat([tip, mean.new_ones(self.tension_size), zeta, mean.new_zeros(6)])
         return torch.cat([mean, torch.zeros_like(held)]), torch.cat([precision, held])

@@ -30,13 +30,16 @@ from .starts import Start, StartRule, cold_start
 FIRST = 1 / 400  # of the rod's length: 1 mm on the paper's
 ROUNDS = 6
 SETTLED = 0.01  # relative change of sigma
-LEAST = 1e-9  # m
+LEAST = 1e-5  # of the rod's length: no rod is a rod to less, and neither the width of a load nor the steps of the model count there
 SMOOTH = 3.09  # standard deviations of rho: 99.9 %
 
 
 @dataclass(frozen=True)
 class Noise:
-    """sigma (B,) m and its standard deviation, std (B,) m; freedom (B,): nu of (1). NaN where nothing is left to tell it from."""
+    """sigma (B,) m and its standard deviation, std (B,) m; freedom (B,): nu of (1). NaN where nothing is left to tell it from.
+
+    std is 0 where the residual is smaller than LEAST, which then stands in for sigma, and chi^2 is a test as ever.
+    """
 
     sigma: Float[Tensor, " B"]
     std: Float[Tensor, " B"]
@@ -44,14 +47,15 @@ class Noise:
 
     def judged(self, fit: Estimate) -> Estimate:
         """The fit with spreads for a noise that was estimated, accepted where the residual is white (2)."""
-        factor = torch.from_numpy(stdtrit(self.freedom.clamp(min=1).numpy(), 0.975)) / Z95
+        told = self.std != 0
+        factor = torch.from_numpy(stdtrit(self.freedom.clamp(min=1).numpy(), 0.975)).where(told, Z95) / Z95
 
         def wider(C: Tensor | None) -> Tensor | None:
             return None if C is None else C * factor.square().reshape(-1, *[1] * (C.ndim - 1))
 
         spreads = {name: wider(getattr(fit, name)) for name in ("covariance", "load_covariance", "tip_covariance")}
         std = None if fit.tension_std is None else fit.tension_std * factor.unsqueeze(-1)
-        return replace(fit, accepted=fit.accepted & white(fit), tension_std=std, **spreads)
+        return replace(fit, accepted=fit.accepted & (white(fit) | ~told), tension_std=std, **spreads)
 
 
 def white(fit: Estimate) -> Bool[Tensor, " B"]:
@@ -68,7 +72,7 @@ def _sigma(model: Model, fit: Estimate) -> tuple[Float[Tensor, " B"], Float[Tens
     used = torch.isfinite(fit.residual[..., 0]) & ~fit.outlier
     nu = 3.0 * used.sum(-1) - model.free_size + model.coordinates.informative_priors
     square = torch.where(used, fit.residual.square().sum(-1), 0.0).sum(-1)
-    return torch.where(nu > 0, (square / nu).sqrt().clamp(min=LEAST), torch.nan), nu
+    return torch.where(nu > 0, (square / nu).sqrt().clamp(min=LEAST * model.robot.rod.length), torch.nan), nu
 
 
 def estimate_noise(
@@ -92,7 +96,8 @@ def estimate_noise(
             break
         begin = _onward(fit)
     known = nu > 0
-    noise = Noise(sigma.where(known, torch.nan), (sigma / (2 * nu.clamp(min=1)).sqrt()).where(known, torch.nan), nu)
+    std = torch.where(sigma > LEAST * L, sigma / (2 * nu.clamp(min=1)).sqrt(), 0.0)
+    noise = Noise(sigma.where(known, torch.nan), std.where(known, torch.nan), nu)
     return noise, replace(markers, sigma=sigma)
 
 

@@ -54,9 +54,12 @@ class Observability:
     localizable: Float[Tensor, "K D"]
 
 
-def push_model(robot: Robot, registration: bool = False, steps: int = DEFAULT_STEPS) -> Model:
-    """The estimator's model of one contact, without a prior."""
-    return Model(robot, GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale, "none"), registration, steps=steps)
+def push_model(
+    robot: Robot, registration: bool = False, steps: int = DEFAULT_STEPS, frame_std: tuple[float, float] | None = None
+) -> Model:
+    """The estimator's model of one contact, without a prior on it."""
+    loads = GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale, "none")
+    return Model(robot, loads, registration, steps=steps, frame_std=frame_std)
 
 
 def places(robot: Robot, count: int, nearest: float | None = None) -> Float[Tensor, " K"]:
@@ -144,14 +147,16 @@ def load_bound(
     registration: bool = False,
     width_known: bool = True,
     steps: int = DEFAULT_STEPS,
+    frame_std: tuple[float, float] | None = None,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, by (1).
 
     force: N, section frame, not zero; location: m, inside the rod; base_wrench: N, N m, in equilibrium with the push; noise:
     standard deviation of a marker coordinate (m). Markers count where their positions are finite; the numbers play no part.
+    frame_std: with registration, what is known of the base frame (m, rad), as Model.frame_std.
     A bound is inf where the markers do not show the push, NaN where the base wrench is.
     """
-    model = push_model(robot, registration, steps)
+    model = push_model(robot, registration, steps, frame_std)
     unknown = (0, 1, 2) if width_known else (0, 1, 2, 3)
     C, singular = _bounded(model, state(model, force, location, base_wrench), markers, noise, unknown)
     along = force / force.norm(dim=-1, keepdim=True)

@@ -1,7 +1,8 @@
 """How many loads, and of what kind: the Bayesian information criterion, each sample deciding for itself.
 
 Stage k fits k contacts to the samples that still need it: those that no fit so far explains, and those whose residual asks for one
-more load by the score test of torchrod.probe, from which its fit starts.
+more load by the score test of torchrod.probe, from which its fit starts. Where something at the tip competes, there is a way back:
+a fit with fewer loads may only have been led astray, so it is tried again from the one that was chosen, without one of its loads.
 """
 
 import math
@@ -14,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .estimator import Settings, estimate
+from .estimator import Settings, check, estimate, usable
 from .fit import Evidence
 from .measurement import Markers, Model
 from .probe import probe, start_with_one_more
@@ -103,19 +104,22 @@ def select(
     Loads that the chosen hypothesis does not have are NaN.
 
     start: the rule a model starts by where the residual of an earlier fit suggests nothing. A sample for which nothing converges is
-    reported with the fit that left the smallest chi^2. Errors: ValueError where there are too few markers for the first hypothesis.
+    reported with the fit that left the smallest chi^2. One with too few markers for any load is invalid: it would show none.
+    Errors: ValueError where that is so of the whole file.
     """
+    markers = _that_show_a_load(hypotheses, markers, noise)
     B = len(markers.positions)
     hasty = replace(settings, restarts=())  # a count that is too low fails however it starts
     fit: Estimate | None = None
     scores = torch.full((B, len(hypotheses)), torch.nan, dtype=torch.float64)
+    foreseen = scores.clone()
     best, choice = torch.full((B,), torch.inf, dtype=torch.float64), torch.zeros(B, dtype=torch.int64)
     fits: dict[str, tuple[Estimate, Int[Tensor, " b"]]] = {}
     for h, hypothesis in enumerate(hypotheses):
         model = hypothesis.model
         if fit is not None and 3 * len(markers.s) < model.free_size:
             continue
-        index, begin = _needed(hypothesis, hypotheses, fits, markers, noise, start(model))
+        index, begin = _needed(hypothesis, hypotheses, fits, markers, noise, start(model), foreseen[:, h])
         if not len(index):
             continue
         part = markers.take(index)
@@ -130,14 +134,88 @@ def select(
         fit = _replaced(fit, other, index, lower)
         best[index[lower]], choice[index[lower]] = scores[index[lower], h], h
     assert fit is not None
+    fit = _simplified(hypotheses, fit, choice, scores, markers, noise, hasty)
+    if settings.restarts:
+        fit = _tried_again(hypotheses, fit, choice, scores, markers, noise, settings, start)
+    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores, foreseen)
+
+
+def _simplified(
+    hypotheses: list[Hypothesis],
+    fit: Estimate,
+    choice: Int[Tensor, " B"],
+    scores: Float[Tensor, "B H"],
+    markers: Markers,
+    noise: float,
+    settings: Settings,
+) -> Estimate:
+    """The fit on the way back; choice and scores change with it."""
+    for more, fewer, dropped in _ways_back(hypotheses):
+        index = ((choice == more) & fit.accepted).nonzero().squeeze(-1)
+        if not len(index):
+            continue
+        model, part = hypotheses[fewer].model, markers.take(index)
+        x = _with_one_less(fit.x[index], hypotheses[more].model, model, dropped)
+        other = estimate(model, part, noise, settings, _from(Start(x, None, torch.ones_like(index, dtype=torch.bool))))
+        again = bic(other, model, part)
+        lower = again < scores[index, more]
+        fit = _replaced(fit, other, index, lower)
+        scores[index[lower], fewer], choice[index[lower]] = again[lower], fewer
+    return fit
+
+
+def _tried_again(
+    hypotheses: list[Hypothesis],
+    fit: Estimate,
+    choice: Int[Tensor, " B"],
+    scores: Float[Tensor, "B H"],
+    markers: Markers,
+    noise: float,
+    settings: Settings,
+    start: Callable[[Model], StartRule],
+) -> Estimate:
+    """The fit with restarts of the chosen hypothesis where that explains nothing; scores change with it."""
     for h, hypothesis in enumerate(hypotheses):
         index = ((choice == h) & ~fit.accepted & torch.isfinite(fit.x[:, -1])).nonzero().squeeze(-1)
-        if len(index) and settings.restarts:
-            part = markers.take(index)
-            other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
-            fit = _replaced(fit, other, index, other.accepted)
-            scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
-    return fit, Evidence(tuple(h.name for h in hypotheses), choice, scores)
+        if not len(index):
+            continue
+        part = markers.take(index)
+        other = estimate(hypothesis.model, part, noise, settings, start(hypothesis.model))
+        fit = _replaced(fit, other, index, other.accepted)
+        scores[index[other.accepted], h] = bic(other, hypothesis.model, part)[other.accepted]
+    return fit
+
+
+def _ways_back(hypotheses: list[Hypothesis]) -> list[tuple[int, int, int]]:
+    """Where something at the tip competes: a hypothesis, one with a contact less, and which contact to leave out; the most first.
+
+    Numbers of contacts alone are not worth it: there a fit with too few loads that explains nothing is nearly always what it seems.
+    """
+    if len({h.model.tip for h in hypotheses}) < 2:
+        return []
+    found = []
+    for more, a in reversed(list(enumerate(hypotheses))):
+        for fewer, b in enumerate(hypotheses):
+            kept = same_kind(a.model, b.model) or (b.model.tip != "none" and same_kind(a.model, replace(b.model, tip="none")))
+            if a.contacts > 1 and b.contacts == a.contacts - 1 and kept:
+                found += [(more, fewer, dropped) for dropped in range(a.contacts)]
+    return found
+
+
+def _with_one_less(x: Float[Tensor, "b m"], more: Model, fewer: Model, dropped: int) -> Float[Tensor, "b n"]:
+    """A start for `fewer`: the state of `more` without one of its loads; what acts on the tip, if that is new, is still nothing."""
+    g, n = more.coordinates.size, fewer.coordinates.size
+    kept = torch.cat([x[:, : (g - n) * dropped], x[:, (g - n) * (dropped + 1) : g]], -1)
+    tip = x[:, g : more.load_size] if more.tip == fewer.tip else x.new_zeros(len(x), fewer.load_size - n)
+    return torch.cat([kept, tip, x[:, more.load_size : more.size]], -1)
+
+
+def _that_show_a_load(hypotheses: list[Hypothesis], markers: Markers, noise: float) -> Markers:
+    """The markers, without those of samples that have too few for the simplest hypothesis with a load."""
+    loaded = [h.model for h in hypotheses if h.model.load_size]
+    simplest = min(loaded or [hypotheses[0].model], key=lambda model: model.free_size)
+    check(simplest, markers, noise)
+    return replace(markers, positions=markers.positions.where(usable(simplest, markers)[:, None, None], torch.nan))
 
 
 def _explains_better(
@@ -155,8 +233,12 @@ def _needed(
     markers: Markers,
     noise: float,
     rule: StartRule,
+    foreseen: Float[Tensor, " B"],
 ) -> tuple[Int[Tensor, " b"], StartRule]:
-    """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any."""
+    """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any.
+
+    foreseen: takes the BIC that its score test promises.
+    """
     everyone = torch.arange(len(markers.positions))
     before = [h for h in hypotheses if h.contacts == hypothesis.contacts - 1 and same_kind(h.model, hypothesis.model)]
     if not before:
@@ -169,6 +251,7 @@ def _needed(
     found = probe(model, fitted.x.nan_to_num(0.0), markers.take(index), noise)
     per_load = free_parameters(hypothesis.model) - free_parameters(model)
     asked = per_load * torch.log((3.0 * markers.present[index].sum(-1)).clamp(min=math.e))
+    foreseen[index] = bic(fitted, model, markers.take(index)) - found.drop + asked
     wanted = sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)
     rows = wanted.nonzero().squeeze(-1)
     begin = start_with_one_more(hypothesis.model, found.take(rows))

@@ -24,7 +24,8 @@ class Status(IntEnum):
 _MESSAGES = {
     Status.CONVERGED: "Converged.",
     Status.NOT_CONVERGED: "Did not converge: check units, marker order and tensions; then state more noise or more iterations.",
-    Status.INVALID: "Not enough finite numbers: give this sample more markers and finite tensions, or fewer unknown loads.",
+    Status.INVALID: "No fit: too few markers for the unknowns, or numbers that leave the rod no shape; "
+    "give this sample more markers or fewer unknown loads, and check the units of robot and tensions.",
 }
 
 

@@ -17,16 +17,17 @@ def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noi
         status = Status(int(result.status[b])).label
         ok = "yes" if result.accepted[b] else "no"
         rms = float(result.rms_residual[b]) * 1e3
-        present = [k for k in range(result.force.shape[1]) if status == "invalid" or not math.isnan(float(result.force[b, k, 0]))]
+        present = [k for k in range(result.force.shape[1]) if not math.isnan(float(result.force[b, k, 0]))]
         for k in present or [None]:
             head = f"{name:>8}  {status:<13} {ok:<4}" if k in (0, None) else " " * 28
             if k is None:
-                lines.append(f"{head}{'-':>4}{'no load':>20}{'':>40}{rms:>10.3f}")
+                none = "no load" if status != "invalid" else "-"
+                lines.append(f"{head}{'-':>4}{none:>20}{'':>40}{rms:>10.3f}")
                 continue
             force = f"{float(result.magnitude[b, k]):.4f} +- {float(result.magnitude_std[b, k]):.4f}"
             place = f"{float(result.location[b, k]) * 1e3:.1f} +- {float(result.location_std[b, k]) * 1e3:.1f}"
             fx, fy = result.force[b, k].tolist()
-            lines.append(f"{head}{k + 1:>4}{force:>20}{fx:>10.4f}{fy:>10.4f}{place:>20}{rms:>10.3f}")
+            lines.append(f"{head}{k + 1:>4}{force:>20} {fx:>9.4f} {fy:>9.4f}{place:>20} {rms:>9.3f}")
         if result.tip is not None and result.tip_covariance is not None and not bool(result.tip[b].isnan().all()):
             std = result.tip_covariance[b].diagonal().sqrt().tolist()
             both = [f"{v:.4f} +- {s:.4f}" for v, s in zip(result.tip[b].tolist(), std, strict=True) if s > 0 or math.isnan(s)]

@@ -33,9 +33,9 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def model(count: int, prior: str = "contact", registration: bool = False) -> Model:
+def model(count: int, prior: str = "contact", registration: bool = False, frame_std: tuple[float, float] | None = None) -> Model:
     """The default model of so many pushes."""
-    return Model(ROBOT, GaussianCoordinates(count, L, ROBOT.rod.force_scale, prior), registration)
+    return Model(ROBOT, GaussianCoordinates(count, L, ROBOT.rod.force_scale, prior), registration, frame_std=frame_std)
 
 
 def pushes(count: int, samples: int, g: torch.Generator, size: tuple[float, float] = (0.5, 1.0)) -> tuple[Tensor, Tensor]:

@@ -105,8 +105,13 @@ def _profile(profile: Profile) -> str:
 
 
 def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
-    bic = {name: _plain(value) for name, value in zip(evidence.names, evidence.bic[b].tolist(), strict=True)}
-    return {"chosen": evidence.names[int(evidence.choice[b])], "bic": bic}
+    rows = list(zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True))
+    return {
+        "chosen": evidence.names[int(evidence.choice[b])],
+        "bic": {name: _plain(value) for name, value, _ in rows},
+        "not_converged": [name for name, value, _ in rows if math.isinf(value)],
+        "bic_foreseen": {name: _plain(promised) for name, value, promised in rows if math.isnan(value)},
+    }
 
 
 def write_result(
@@ -143,7 +148,7 @@ def write_result(
         return
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
-        arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic}
+        arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
     for name in ("magnitude_location_covariance", "location_interval"):
         arrays[name] = getattr(estimate, name)
     if noise is not None:

@@ -11,11 +11,10 @@ import numpy as np
 import torch
 
 from ..errors import InputError
-from ..geometry import nearest_reach, unit_hint
+from ..geometry import too_far, too_short
 from ..measurement import Markers
 from ..robot import Robot
 
-REACH = 3.0  # in rod lengths: where even the nearest sample is typically farther from the base, unit or frame are wrong
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
 
@@ -41,9 +40,8 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     if bool(outside.any()):
         hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
-    reach = nearest_reach(markers.positions, L)
-    if reach > REACH:
-        raise InputError(f"{path}: positions reach {reach * L:.3g} m on a rod of {L:g} m; {unit_hint(reach)}")
+    if said := too_short(markers.s, L) or too_far(markers, L):
+        raise InputError(f"{path}: {said}")
     T = len(robot.tendons)
     if T and markers.tension is None:
         raise InputError(f"{path}: tensions are missing; the robot has {T} tendons, add tension_1..tension_{T} (N)")
