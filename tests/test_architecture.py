@@ -1,6 +1,7 @@
 """The house rules that a machine can check."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,30 +13,18 @@ import torchrod
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = sorted((ROOT / "torchrod").rglob("*.py"))
 SCRIPTS = sorted((ROOT / "scripts").rglob("*.py")) + sorted((ROOT / "training").rglob("*.py"))
+PICTURE = (ROOT / "docs" / "architecture.md").read_text().split("```")[1].strip("\n").splitlines()
+COMMANDS = sorted(path.stem for path in MODULES if path.stem.endswith("_command"))
+
+
+def layer(line: str) -> set[str]:
+    """The modules of a line of docs/architecture.md: what stands left of the explanation."""
+    names = re.split(r" +", line[:42].strip())
+    return {name for given in names for name in (COMMANDS if given == "*_command" else [given])}
+
+
 # From the command line down to the Lie-group helpers: a module imports only from layers below its own.
-LAYERS = [
-    {"cli"},
-    {"calibrate_command", "estimate_command", "observability_command", "plot_command", "simulate_command"},
-    {"arguments", "table"},
-    {"production", "observability_figure"},
-    {"io", "plot", "selection"},
-    {"calibration", "placement"},
-    {"unloaded", "observability"},
-    {"probe", "stream", "diagnosis", "noise", "frame"},
-    {"estimator", "warmstart"},
-    {"result", "starts", "features", "network"},
-    {"fit", "equilibrium"},
-    {"prepared", "profile", "geometry"},
-    {"ekf", "measurement", "dataset", "actuation"},
-    {"coordinates", "statics"},
-    {"march"},
-    {"fast"},
-    {"step", "grid"},
-    {"robot"},
-    {"loads", "tendons"},
-    {"rod"},
-    {"lie", "jacobian", "status", "errors", "threads"},
-]
+LAYERS = [layer(line) for line in PICTURE]
 
 PACKAGES = ("io", "fast", "coordinates")
 

@@ -3,11 +3,11 @@
 
 #include "measure.h"
 
-// Cholesky of A scaled to unit diagonal, and through it A^-1: ekf.py, solve_spd. NaN where A is not positive definite.
-struct Inverse {
+// Cholesky of A scaled to unit diagonal, L L^T: ekf.py, solve_spd. NaN where A is not positive definite.
+struct Factor {
     int64_t n;
-    V *L, *scale;  // the scaled factor's inverse, lower triangle; 1 / sqrt of the diagonal
-    Inverse(int64_t n, const V* A, V* room) : n(n), L(room), scale(room + n * n) {
+    V *L, *scale;  // lower triangle with 1 / L_jj on its diagonal; 1 / sqrt of A's diagonal
+    Factor(int64_t n, const V* A, V* room) : n(n), L(room), scale(room + n * n) {
         for (int64_t i = 0; i < n; i++) scale[i] = 1.0 / root(A[i * n + i]);
         for (int64_t j = 0; j < n; j++) {
             V pivot = splat(1.0);
@@ -20,7 +20,24 @@ struct Inverse {
                 L[i * n + j] = sum * inverse;
             }
         }
-        for (int64_t j = 0; j < n; j++)  // in place: the factor's inverse, column by column
+    }
+    // g^T A^-1 g, by one substitution.
+    V square(const V* g, V* middle) const {
+        V sum = V{};
+        for (int64_t i = 0; i < n; i++) {
+            V next = scale[i] * g[i];
+            for (int64_t k = 0; k < i; k++) next -= L[i * n + k] * middle[k];
+            middle[i] = next * L[i * n + i];
+            sum += middle[i] * middle[i];
+        }
+        return sum;
+    }
+};
+
+// A^-1 through the factor's inverse, which takes its place.
+struct Inverse : Factor {
+    Inverse(int64_t n, const V* A, V* room) : Factor(n, A, room) {
+        for (int64_t j = 0; j < n; j++)  // column by column
             for (int64_t i = j + 1; i < n; i++) {
                 V sum = V{};
                 for (int64_t k = j; k < i; k++) sum -= L[i * n + k] * L[k * n + j];
@@ -76,10 +93,7 @@ inline void advance(const Filter& f, const Lanes& lanes, int64_t n, const Normal
             A[k] = N.A[0][k] + N.A[1][k] + (i == j ? splat(f.precision[i]) : V{});
             sound &= finite(A[k]);
         }
-    const Inverse full(n, A, factor);
-    full.times(g, step, middle);
-    V decrement = V{};
-    for (int64_t i = 0; i < n; i++) decrement += g[i] * step[i];
+    const V decrement = Factor(n, A, factor).square(g, middle);
     const Mask done = (decrement < larger(f.decrement_share * cost, splat(f.decrement))) & sound;
 
     // Residual-adaptive noise: ekf.py, inflation and adapted_weights.

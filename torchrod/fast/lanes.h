@@ -54,10 +54,11 @@ INLINE V error_function(V x, V bell) {
         0.000293714378044958,  -0.0002901540805408417, 5.164652974177416e-05,  2.238423915508223e-05, -1.1438048033346894e-05,
         -9.73559896736775e-07, 1.7419821586224816e-06, -5.7218230603224086e-08, -2.4857126248016745e-07, 2.3263508708859124e-08,
         3.197926671666804e-08, -3.744210080962018e-09, -2.623107347133476e-09, 3.1114333809799254e-10};
-    const V away = x < 0 ? -x : x, size = away > 30 ? splat(30.0) : away, t = (size - 3.75) / (size + 3.75), square = t * t;
+    const V away = x < 0 ? -x : x, size = away > 30 ? splat(30.0) : away, twice = 1.0 + 2.0 * size, far = size + 3.75;
+    const V both = 1.0 / (twice * far), t = (size - 3.75) * twice * both, square = t * t;  // a division less
     V even = splat(f[22]), odd = splat(f[23]);  // two chains of half the length
     for (int k = 20; k >= 0; k -= 2) even = even * square + f[k], odd = odd * square + f[k + 1];
-    const V result = 1.0 - bell * (even + t * odd) / (1.0 + 2.0 * size);
+    const V result = 1.0 - bell * (even + t * odd) * (far * both);
     return x < 0 ? -result : result;
 }
 

@@ -23,22 +23,22 @@ INLINE V bell(V x) {  // exp(-x^2), but never so small that it is no longer a no
     return exponential(-smaller(x * x, splat(700.0)));
 }
 struct BumpAt {
-    V mu, c, r, x0, E0, X0;  // r = sqrt(c), x0 = -r mu, E0 = erf(x0), X0 = exp(-x0^2)
-    BumpAt(V mu, V c) : mu(mu), c(c), r(root(c)), x0(-r * mu) {
+    V mu, r, x0, E0, X0, per_r, per_2c;  // r = sqrt(c), x0 = -r mu, E0 = erf(x0), X0 = exp(-x0^2), 1 / r, 1 / (2 c)
+    BumpAt(V mu, V c) : mu(mu), r(root(c)), x0(-r * mu), per_r(1.0 / r), per_2c(0.5 / c) {
         X0 = bell(x0);
         E0 = error_function(x0, X0);
     }
     Bump operator()(V s) const {
         const double half = 0.5 * std::sqrt(M_PI);
-        const V x = r * (s - mu), area = half / r;
+        const V x = r * (s - mu), area = half * per_r;
         const V X = bell(x), E = error_function(x, X);
         Bump b;
         b.once = area * (E - E0);
-        b.again = area / r * (x * E - x0 * E0 + (X - X0) * (0.5 / half) - (x - x0) * E0);
+        b.again = area * per_r * (x * E - x0 * E0 + (X - X0) * (0.5 / half) - (x - x0) * E0);
         b.once_mu = X0 - X;
         b.again_mu = s * X0 - b.once;
-        b.once_c = ((X * x - X0 * x0) / r - b.once) / (2.0 * c);
-        b.again_c = ((0.5 * (X0 - X) / r - X0 * x0 * s) / r - b.again) / (2.0 * c);
+        b.once_c = ((X * x - X0 * x0) * per_r - b.once) * per_2c;
+        b.again_c = ((0.5 * (X0 - X) * per_r - X0 * x0 * s) * per_r - b.again) * per_2c;
         return b;
     }
 };
@@ -58,6 +58,7 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
     const Bump whole = at(L);
     // net: G = F once / S with S = once(L), so that F stays what the rod feels; paper: G = a once.
     const V S = net ? whole.once : splat(1.0), S_mu = net ? whole.once_mu : V{}, S_c = net ? whole.once_c : V{};
+    const V per_S = 1.0 / S;
     const double unit = net ? l.force_scale : 1.0;
     const V F[2] = {unit * x(first), unit * x(first + 1)};
     V previous = splat(std::numeric_limits<double>::quiet_NaN());
@@ -66,13 +67,13 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
         const V s = p < points ? fetch(l.s, g.lanes, p) : L;
         if (any(~(s == previous))) b = at(s);  // a step begins where the last one ended
         previous = s;
-        const V q[2] = {b.once / S, b.again / S};
+        const V q[2] = {b.once * per_S, b.again * per_S};
         V* to = local + p * row;
         for (int axis = 0; axis < 2; axis++)
             for (int o = 0; o < 2; o++) to[axis + 3 * o] += F[axis] * q[o];  // G, then G2
         if (!slopes) continue;
-        const V q_mu[2] = {(b.once_mu - q[0] * S_mu) / S * dmu, (b.again_mu - q[1] * S_mu) / S * dmu};
-        const V q_c[2] = {(b.once_c - q[0] * S_c) / S * dc, (b.again_c - q[1] * S_c) / S * dc};
+        const V q_mu[2] = {(b.once_mu - q[0] * S_mu) * per_S * dmu, (b.again_mu - q[1] * S_mu) * per_S * dmu};
+        const V q_c[2] = {(b.once_c - q[0] * S_c) * per_S * dc, (b.again_c - q[1] * S_c) * per_S * dc};
         for (int axis = 0; axis < 2; axis++)
             for (int o = 0; o < 2; o++) {
                 const int part = axis + 3 * o;
