@@ -166,6 +166,8 @@ class Estimate:
     @staticmethod
     def cat(parts: list["Estimate"]) -> "Estimate":
         """Join the estimates of several chunks."""
+        if len(parts) == 1:
+            return parts[0]
 
         def joined(values: list[Tensor | None]) -> Tensor | None:
             present = [v for v in values if v is not None]
