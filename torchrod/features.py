@@ -115,7 +115,8 @@ def smoothed(
     """(2) from displacements over L; s, length and noise in m. Each pattern of markers seen is solved once."""
     y = torch.where(seen.unsqueeze(-1), y, 0.0)
     if bool(seen.all()):
-        out = _kriging_of_all(s, s._version, length, noise / length) @ y
+        rows = y.mT.flatten(0, 1) @ _kriging_of_all(s, s._version, length, noise / length)[0].mT  # one product for all samples
+        out = rows.unflatten(0, (-1, 3)).mT
     else:
         patterns, which = torch.unique(seen, dim=0, return_inverse=True)
         out = kriging(s / length, patterns, noise / length)[which] @ y
@@ -169,7 +170,7 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
 
 def prior_log_c(model: Model) -> float:
     """The prior mean of log(c L^2), which closes every Gaussian load's entries of gamma."""
-    return float(model.coordinates.prior()[0][-1])
+    return float(model.prior()[0][model.coordinates.size - 1])
 
 
 def _known(

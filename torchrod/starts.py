@@ -41,14 +41,14 @@ def in_equilibrium(
     return model.join(gamma, at_rest(model, markers, gamma, q_tip).wrench.nan_to_num(0.0))
 
 
-def cost_in_equilibrium(
-    model: Model, markers: Markers, noise: float, x: Float[Tensor, "B n"], p: Float[Tensor, "B P 3"]
-) -> Float[Tensor, " B"]:
-    """The cost of (3) with the prior's at x, whose shape p (m) in equilibrium is known at the markers: there is no tip residual."""
+def costs_in_equilibrium(
+    model: Model, markers: Markers, noise: float, x: Float[Tensor, "B k n"], p: Float[Tensor, "B k P 3"]
+) -> Float[Tensor, "B k"]:
+    """The cost of (3) with the prior's at k states x, whose shapes p (m) in equilibrium are known: there is no tip residual."""
     mean, precision = model.prior()
-    w = model.weights(markers, noise)[:, :-6]
-    r = torch.where(w > 0, (markers.positions - p).flatten(1), 0.0)
-    return (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+    w = model.weights(markers, noise)[:, None, :-6:3]  # of a marker, the same in all directions
+    square = (markers.positions.unsqueeze(1) - p).square().sum(-1)
+    return torch.where(w > 0, w * square, 0.0).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
 
 
 def cold_start(model: Model, markers: Markers, noise: float) -> Start:

@@ -16,7 +16,7 @@ from .features import Features, features, is_active, prior_log_c
 from .measurement import Markers, Model
 from .network import PER_LOAD, Network, load_checkpoint, turn_of_gamma
 from .rod import Rod
-from .starts import Start, cold_from, cold_start, cost_in_equilibrium
+from .starts import Start, cold_from, cold_start, costs_in_equilibrium
 
 SLACK = 1.001  # on a stated range: 0.1 mm on 0.4 m is 2.5e-4 but for round-off
 INFLATION = 10.0  # of the predicted covariance: on cases it has not seen a network errs more than it thinks
@@ -83,12 +83,12 @@ class WarmStart:
         prediction = self.network(part.x, part.amp, log_c) if self.predicted_spread else None
         gamma = self.network.guess(part.x, part.amp, log_c) if prediction is None else prediction.gamma
         gamma = (turn.mT @ gamma.unsqueeze(-1)).squeeze(-1)
-        seen = markers.take(index)
+        seen = markers if len(index) == len(warm) else markers.take(index)
         rest = at_rest(model, seen, gamma, part.q_tip)
         guessed = model.join(gamma, rest.wrench.nan_to_num(0.0))
         x, costs = cold.index_copy(0, index, guessed), cold.new_zeros(len(cold), 2)
-        costs[index, 0] = cost_in_equilibrium(model, seen, noise, guessed, rest.p)
-        costs[index, 1] = cost_in_equilibrium(model, seen, noise, cold[index], part.p0)
+        both = torch.stack([guessed, cold[index]], 1), torch.stack([rest.p, part.p0], 1)
+        costs[index] = costs_in_equilibrium(model, seen, noise, *both)
         if prediction is None:
             return Start(x, None, warm, cold, costs)
         Sigma0 = torch.eye(model.size, dtype=x.dtype).repeat(len(x), 1, 1)
