@@ -43,3 +43,20 @@ def test_rotation_vectors_are_romas_and_smooth_at_zero():
     assert torch.allclose(product(q[:20], q[20:40]), roma.quat_product(q[:20], q[20:40]), atol=1e-14)
     _, J = pointwise_jacobian(lambda w: logarithm(exponential(w)), w[20:])
     assert torch.allclose(J, torch.eye(3).expand_as(J), atol=1e-12)
+
+
+def test_the_slope_of_a_gaussians_report_is_its_derivative():
+    torch.manual_seed(0)
+    for locations in (None, (0.1, 0.3)):
+        c = GaussianCoordinates(2, 0.4, 1.3, "contact", locations)
+        gamma = c.start() + 0.4 * torch.randn(5, c.size)
+
+        def described(gamma: torch.Tensor) -> torch.Tensor:
+            report = c.describe(gamma)  # noqa: B023 - called within its turn of the loop
+            return torch.cat([report.force, report.location.unsqueeze(-1), report.width.unsqueeze(-1)], -1).flatten(-2)
+
+        _, whole = pointwise_jacobian(described, gamma)
+        slope = c.report_slope(gamma)
+        blocks = torch.zeros(5, 2, 4, 2, c.per_load)
+        blocks[:, range(2), :, range(2)] = slope.movedim(1, 0)
+        assert torch.allclose(whole, blocks.flatten(3, 4).flatten(1, 2), rtol=1e-12, atol=1e-14)
