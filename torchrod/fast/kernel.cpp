@@ -1,6 +1,7 @@
 // The library's entry points: each shares its samples among threads, in groups of W.
 
 #include <algorithm>
+#include <atomic>
 #include <thread>
 
 #include "balance.h"
@@ -9,19 +10,24 @@
 
 namespace {
 
-// work(from, to) for shares of 0 .. count, one to a thread.
-template <class Work> void in_parts(int64_t count, int64_t threads, Work work) {
-    if (threads > count) threads = count;
-    if (threads <= 1) return work(int64_t(0), count);
+// work(from, to) for parts of 0 .. count, a few to a thread and no smaller than `least`: a thread takes the next one when it is free,
+// so that a core which is busy elsewhere does not keep the others waiting.
+template <class Work> void in_parts(int64_t count, int64_t least, int64_t threads, Work work) {
+    const int64_t size = std::max(least, count / (4 * threads) + 1);
+    if (threads <= 1 || size >= count) return work(int64_t(0), count);
+    std::atomic<int64_t> next{0};
+    auto some = [&] {
+        for (int64_t from; (from = next.fetch_add(size)) < count;) work(from, std::min(from + size, count));
+    };
     std::vector<std::thread> pool;
-    for (int64_t t = 1; t < threads; t++) pool.emplace_back(work, count * t / threads, count * (t + 1) / threads);
-    work(int64_t(0), count / threads);
+    for (int64_t t = 1; t < threads; t++) pool.emplace_back(some);
+    some();
     for (auto& thread : pool) thread.join();
 }
 
 // work(lanes, room, numbers) for groups of W samples.
 template <class Work> void in_groups(int64_t count, const int64_t* index, int64_t threads, Work work) {
-    in_parts((count + W - 1) / W, threads, [&](int64_t from, int64_t to) {
+    in_parts((count + W - 1) / W, 1, threads, [&](int64_t from, int64_t to) {
         Room room;
         std::vector<V> numbers;
         for (int64_t g = from; g < to; g++) {
@@ -189,7 +195,8 @@ static void run(const Course& c, const int64_t* index, int64_t count) {
 }
 
 void torchrod_filter(const Course* c, const int64_t* index, int64_t count, int64_t threads) {
-    in_parts(count, threads, [&](int64_t from, int64_t to) { run(*c, index + from, to - from); });
+    // Each part ends with lanes that are not filled; in parts this large that is a few percent.
+    in_parts(count, 32 * W, threads, [&](int64_t from, int64_t to) { run(*c, index + from, to - from); });
 }
 
 // The base wrench (b, 6) in equilibrium with the loads of x (b, n), how far it is from that (b), the centre line (b, P, 3) and the
@@ -215,7 +222,7 @@ void torchrod_balance(const Fit* f, const double* x, const double* q_tip, int64_
 void torchrod_perceptron(const Perceptron* p, const float* x, int64_t count, float* y, int64_t threads) {
     const int64_t in = p->sizes[0], out = p->sizes[p->depth], block = FLOATS * BLOCK, blocks = (count + block - 1) / block;
     const int64_t widest = *std::max_element(p->sizes, p->sizes + p->depth + 1);
-    in_parts(blocks, threads, [&](int64_t from, int64_t to) {
+    in_parts(blocks, 1, threads, [&](int64_t from, int64_t to) {
         std::vector<F> numbers(2 * widest * BLOCK);
         for (int64_t first = from * block; first < to * block; first += block) {
             const int64_t here = count - first < block ? count - first : block;
