@@ -21,7 +21,7 @@ from .status import Learned, Status
 from .threads import one_thread
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
-FEW = 16  # samples that one thread estimates sooner than two
+FEW = 1024  # samples for which torch's own share is done sooner on one thread
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30

@@ -14,22 +14,15 @@ from torchrod.prepared import Prepared
 from .cases import Case
 
 
-def one_iteration(prepared: Prepared, sums: fast.Sums, at: ekf.Iterate, Sigma0: torch.Tensor) -> None:
-    """One pass of the filter as torchrod.estimate does it, in place.
-
-    This is what the tables call an iteration: h, H, the normal equations and the update. What is prepared once for all iterations
-    of a fit is not in it.
-    """
-    prepared.iteration(at, Sigma0, torch.ones_like(at.x[0]), ekf.Limits(), sums)(torch.arange(len(at.x)))
-
-
 class TorchrodPeer:
     """torchrod on one case."""
 
     def __init__(self, problem: Problem):
         self.case = Case(problem.loads, problem.registration, len(problem.keep), _steps(problem), problem.noise)
         self.model, self.s = self.case.model(), self.case.markers_at()
-        self._ready: tuple[np.ndarray | None, list[tuple[Prepared, fast.Sums]]] = (None, [])
+        self._given: tuple[np.ndarray, ...] = ()  # the arrays that `iterate` was made ready for, and what it then calls
+        self._calls: list[Callable[[], object]] = []
+        self._before = self._done = np.empty(0)
 
     def markers(self, positions: np.ndarray) -> Markers:
         """Of some samples."""
@@ -42,19 +35,30 @@ class TorchrodPeer:
         return h.numpy(), H.numpy()
 
     def iterate(self, x: np.ndarray, Sigma: np.ndarray, cap: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """See `peers.Peer`; in the estimator's own chunks."""
-        if self._ready[0] is not positions:
-            self._ready = (positions, [self._prepared(positions[k : k + CHUNK]) for k in range(0, len(x), CHUNK)])
-        after, before = (x.copy(), Sigma.copy(), x.copy(), cap.copy(), np.zeros(len(x), dtype=np.bool_)), torch.from_numpy(Sigma)
-        for k, (prepared, sums) in enumerate(self._ready[1]):
-            here = slice(k * CHUNK, (k + 1) * CHUNK)
-            one_iteration(prepared, sums, ekf.Iterate(*(torch.from_numpy(a[here]) for a in after)), before[here])
-        return after[0], after[1], after[3], after[4]
+        """See `peers.Peer`; in place, in the estimator's own chunks, which are made ready once for the same arrays."""
+        given = x, Sigma, cap, positions
+        if len(self._given) != len(given) or any(a is not b for a, b in zip(self._given, given, strict=True)):
+            self._given, self._before, self._done = given, x.copy(), np.zeros(len(x), dtype=np.bool_)
+            parts = [slice(k, k + CHUNK) for k in range(0, len(x), CHUNK)]
+            state = x, Sigma, self._before, cap, self._done
+            self._calls = [self._once(positions[p], [a[p] for a in state]) for p in parts]
+        np.copyto(self._before, x)
+        for once in self._calls:
+            once()
+        return x, Sigma, cap, self._done
 
-    def _prepared(self, positions: np.ndarray) -> tuple[Prepared, fast.Sums]:
-        markers = self.markers(positions)
+    def _once(self, positions: np.ndarray, state: list[np.ndarray]) -> Callable[[], object]:
+        """One pass of the filter as torchrod.estimate does it, in place, on one chunk.
+
+        This is what the tables call an iteration: h, H, the normal equations and the update. What is prepared once for all
+        iterations of a fit is not in it.
+        """
+        markers, n = self.markers(positions), self.model.size
+        at = ekf.Iterate(*(torch.from_numpy(a) for a in state))
+        Sigma0, sums = torch.eye(n, dtype=torch.float64).repeat(len(at.x), 1, 1), fast.Sums.room(len(at.x), n, len(self.s))
         prepared = Prepared(self.model, markers, self.model.weights(markers, self.case.noise))
-        return prepared, fast.Sums.room(len(positions), self.model.size, len(self.s))
+        once, index = prepared.iteration(at, Sigma0, torch.ones_like(at.x[0]), ekf.Limits(), sums), torch.arange(len(at.x))
+        return lambda: once(index)
 
     def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:
         """See `peers.Peer`, for the comparison of answers: all steps fine, as the peers', so that the iterations are the same.

@@ -121,7 +121,10 @@ class Peer(Protocol):
     def iterate(
         self, x: np.ndarray, Sigma: np.ndarray, cap: np.ndarray, positions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """One pass of the filter, h and H included: the next x, Sigma, cap (of the adaptive noise), and who has converged."""
+        """One pass of the filter, h and H included: the next x, Sigma, cap (of the adaptive noise), and who has converged.
+
+        In place or not, as comes naturally: what it is handed may be overwritten.
+        """
         ...
 
     def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:

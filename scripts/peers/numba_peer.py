@@ -179,7 +179,7 @@ class NumbaPeer:
         self, x: np.ndarray, Sigma: np.ndarray, cap: np.ndarray, positions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See `peers.Peer`."""
-        x, Sigma, cap, done = x.copy(), Sigma.copy(), cap.copy(), np.zeros(len(x), dtype=np.bool_)
+        done = np.zeros(len(x), dtype=np.bool_)
         in_tasks(iterate_task, self.constants, len(x), x, Sigma, cap, positions.reshape(len(x), -1), done)
         return x, Sigma, cap, done
 

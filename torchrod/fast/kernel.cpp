@@ -10,10 +10,10 @@
 
 namespace {
 
-// work(from, to) for parts of 0 .. count, a few to a thread and no smaller than `least`: a thread takes the next one when it is free,
+// work(from, to) for parts of 0 .. count, several to a thread and no smaller than `least`: a thread takes the next one when it is free,
 // so that a core which is busy elsewhere does not keep the others waiting.
 template <class Work> void in_parts(int64_t count, int64_t least, int64_t threads, Work work) {
-    const int64_t size = std::max(least, count / (4 * threads) + 1);
+    const int64_t size = std::max(least, count / (16 * threads) + 1);
     if (threads <= 1 || size >= count) return work(int64_t(0), count);
     std::atomic<int64_t> next{0};
     auto some = [&] {
@@ -28,8 +28,8 @@ template <class Work> void in_parts(int64_t count, int64_t least, int64_t thread
 // work(lanes, room, numbers) for groups of W samples.
 template <class Work> void in_groups(int64_t count, const int64_t* index, int64_t threads, Work work) {
     in_parts((count + W - 1) / W, 1, threads, [&](int64_t from, int64_t to) {
-        Room room;
-        std::vector<V> numbers;
+        static thread_local Room room;  // its memory serves the next call, too
+        static thread_local std::vector<V> numbers;
         for (int64_t g = from; g < to; g++) {
             Lanes lanes;
             lanes.count = count - g * W < W ? count - g * W : W;

@@ -3,9 +3,11 @@
 import ctypes
 from collections.abc import Mapping
 
-import torch
 from torch import Tensor
 
+from ..threads import kernel_threads
+
+GROUPS = 4  # that are worth a thread
 _I, _D, _P = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
@@ -125,5 +127,5 @@ def fill(structure: ctypes.Structure, tensors: Mapping[str, Tensor | None], numb
 
 
 def threads(samples: int, lanes: int) -> int:
-    """As many as torch has, but none for less than one group of lanes."""
-    return max(1, min(torch.get_num_threads(), samples // lanes))
+    """As many as there are, but none for less than GROUPS groups of lanes."""
+    return max(1, min(kernel_threads(), samples // (GROUPS * lanes)))
