@@ -46,9 +46,10 @@ def costs_in_equilibrium(
 ) -> Float[Tensor, "B k"]:
     """The cost of (3) with the prior's at k states x, whose shapes p (m) in equilibrium are known: there is no tip residual."""
     mean, precision = model.prior()
-    w = model.weights(markers, noise)[:, None, :-6:3]  # of a marker, the same in all directions
     square = (markers.positions.unsqueeze(1) - p).square().sum(-1)
-    return torch.where(w > 0, w * square, 0.0).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+    seen = torch.where(markers.present.unsqueeze(1), square, 0.0).sum(-1)
+    variance = noise**2 if markers.sigma is None else markers.sigma.unsqueeze(-1) ** 2
+    return seen / variance + (precision * (mean - x) ** 2).sum(-1)
 
 
 def cold_start(model: Model, markers: Markers, noise: float) -> Start:

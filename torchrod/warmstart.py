@@ -78,12 +78,12 @@ class WarmStart:
         index, cold = warm.nonzero().squeeze(-1), cold_from(model, read.alpha)
         if not len(index):
             return Start(cold, None, warm)
-        part = read.take(index)
+        everything = len(index) == len(warm)
+        part, seen = (read, markers) if everything else (read.take(index), markers.take(index))
         turn, log_c = turn_of_gamma(part.turn, size // PER_LOAD), torch.full_like(part.amp, prior_log_c(model))
         prediction = self.network(part.x, part.amp, log_c) if self.predicted_spread else None
         gamma = self.network.guess(part.x, part.amp, log_c) if prediction is None else prediction.gamma
         gamma = (turn.mT @ gamma.unsqueeze(-1)).squeeze(-1)
-        seen = markers if len(index) == len(warm) else markers.take(index)
         rest = at_rest(model, seen, gamma, part.q_tip)
         guessed = model.join(gamma, rest.wrench.nan_to_num(0.0))
         x, costs = cold.index_copy(0, index, guessed), cold.new_zeros(len(cold), 2)
