@@ -12,7 +12,7 @@ from .warmstart import find_warm_start
 
 
 class Estimator:
-    """Estimates one shape at a time, each from where the last one ended: three iterations or so, 3 to 5 ms (docs/performance.md).
+    """Estimates one shape at a time, each from where the last one ended: three iterations or so, 2 to 3 ms (docs/performance.md).
 
         estimator = Estimator(model, s, noise=1e-3)
         for positions in camera:

@@ -162,8 +162,8 @@ def runs(case: Case, progress: Callable[[], object]) -> dict[str, Run]:
 
 
 def start_times(part: Part) -> dict[str, float]:
-    """CPU seconds for a batch of TIMED_BATCH: the guess with its check against a cold start; the forward solves in it, without the
-    load (a cold start) and with the guessed one; one filter iteration.
+    """CPU seconds for a batch of TIMED_BATCH: the guess with its check against a cold start; in it the reading of the markers, with
+    the cold start that this needs, and the forward solve under the guessed load; a cold start alone; one filter iteration.
     """
     model, noise = part.model, part.noise
     markers = part.markers.take(torch.arange(TIMED_BATCH) % len(part.oracle))
@@ -178,6 +178,7 @@ def start_times(part: Part) -> dict[str, float]:
     gamma, index = model.split(guess.x)[0], guess.warm.nonzero().squeeze(-1)
     loaded, q_tip = markers.take(index), features(model, markers, noise).q_tip[index]
     return {
+        "read_s": best_of(lambda: features(model, markers, noise)) if len(index) else 0.0,
         "solve_s": best_of(lambda: at_rest(model, loaded, gamma[index], q_tip)) if len(index) else 0.0,
         "start_s": best_of(lambda: better_start(model, markers, noise, warm(model, markers, noise), Sigma0)),
         "cold_s": best_of(lambda: cold_start(model, markers, noise)),

@@ -15,7 +15,7 @@ class Plan:
     """
 
     batches: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384, 65536)
-    rounds: int = 3
+    rounds: int = 2
     budget: float = 1.0
     largest: dict[str, int] = field(default_factory=lambda: {"torchrod, eager": 1024, "scipy": 1})
     growing: tuple[str, ...] = ("torchrod", "torchrod, compiled", "numba", "jax")
