@@ -215,3 +215,24 @@ def test_a_strong_push_near_the_tip_is_found_by_a_restart():
     assert (fit.restarts > 0).tolist() == [True, True, False]
     assert (fit.iterations >= once.iterations).all()
     assert torch.allclose(fit.magnitude, force.norm(dim=-1), rtol=0.02)
+
+
+class Own:
+    """Load coordinates that torchrod does not know, and that have no hash."""
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self):
+        self._known = GaussianCoordinates(1, 0.4, 1.0, "point")
+
+    def __getattr__(self, name):
+        return getattr(self._known, name)
+
+
+def test_coordinates_of_your_own_are_fitted_as_well():
+    robot, s = steel_rod(), torch.linspace(0.04, 0.4, 10)
+    p = solve_shape(robot, (PointForces(T([[[0.6, -0.2, 0.0]]]), T([[0.25]])),), None, s, 1).p
+    own, known = (estimate(Model(robot, c), Markers(s, p), 1e-4) for c in (Own(), GaussianCoordinates(1, 0.4, 1.0, "point")))  # pyright: ignore[reportArgumentType]
+    assert bool(own.accepted)
+    assert torch.allclose(own.force, known.force, rtol=1e-8)
+    assert torch.allclose(own.location, known.location, rtol=1e-8)

@@ -5,6 +5,7 @@ import torch
 
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import Estimator, GaussianCoordinates, Model, PointForces, Status, solve_shape
+from torchrod.threads import kernel_threads, one_thread
 
 FRAMES = 25
 
@@ -48,3 +49,20 @@ def test_a_jump_is_followed_and_reset_forgets():
     estimator.reset()
     again = estimator(p[1])
     assert torch.allclose(again.force, fits[1].force, atol=1e-4)
+
+
+def test_a_few_samples_leave_torch_one_thread_and_the_kernel_all():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with one_thread():
+            assert (torch.get_num_threads(), kernel_threads()) == (1, 2)
+            with one_thread():
+                assert kernel_threads() == 2
+        with one_thread(kernel=True):
+            assert (torch.get_num_threads(), kernel_threads()) == (1, 1)
+        with one_thread(False):
+            assert torch.get_num_threads() == 2
+        assert (torch.get_num_threads(), kernel_threads()) == (2, 2)
+    finally:
+        torch.set_num_threads(before)

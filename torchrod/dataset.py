@@ -191,7 +191,7 @@ def simulate_shard(spec: DatasetSpec, index: int) -> dict[str, np.ndarray]:
     """
     robot, n = spec.robot_of(index), spec.samples_in(index)
     rng, blocks, drawn, kept = _stream(spec, index, 0), [], 0, 0
-    with one_thread():  # and no result can depend on how a sum was divided
+    with one_thread(kernel=True):  # a shard is a process's; and no result can depend on how a sum was divided
         while kept < n:
             count = min(CHUNK, max(n - kept, LEAST_DRAW))
             blocks.append(_solved(spec, robot, rng, count))

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -14,8 +13,6 @@ from .measurement import Markers, Model
 from .prepared import Prepared, family_of, served
 from .statics import LOAD_PER_INCREMENT, ROUGH_TOLERANCE, solve_shape
 
-COARSE_STEPS = 20  # along the rod, as long as the fit is far from the data: within 1e-6 m of the exact shape
-
 
 @dataclass(frozen=True)
 class Rest:
@@ -25,12 +22,6 @@ class Rest:
     p: Float[Tensor, "B P 3"]
 
 
-@lru_cache(maxsize=32)  # so that what a coarse model knows of itself is worked out once
-def coarse(model: Model) -> Model:
-    """The model with no more than COARSE_STEPS steps."""
-    return model if model.steps <= COARSE_STEPS else replace(model, steps=COARSE_STEPS)
-
-
 def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None = None) -> Rest:
     """The base wrench and the shape at markers.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
 
@@ -38,7 +29,7 @@ def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: 
     what does not settle there, and all else, by torchrod.solve_shape, which is the definition.
     """
     B, P = len(gamma), len(markers.s)
-    rough = replace(coarse(model), registration=False, tip="none", tension_std=None)
+    rough = replace(model.coarse, registration=False, tip="none", tension_std=None)
     wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
     settled = torch.zeros(B, dtype=torch.bool)
     if family_of(rough) != "point" and model.robot.gravity.ndim == 1 and served(rough, markers.positions):

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from . import ekf
 from .coordinates import PaperCoordinates
-from .equilibrium import COARSE_STEPS, coarse
 from .fast import Sums, iterate_all
 from .measurement import Markers, Model
 from .prepared import Prepared, served
@@ -32,7 +31,7 @@ class Settings:
     """How the filter is run. Sigma0, Q: the variances (per entry of x) it starts from and adds at every iteration (4).
 
     step_limit: the largest change of any entry in one iteration. adaptive: residual-adaptive noise.
-    coarse: begin with COARSE_STEPS steps along the rod and end, where the fit is near, with the model's own.
+    coarse: begin with measurement.COARSE_STEPS steps along the rod and end, where the fit is near, with the model's own.
     robust: degrees of freedom of Student's t, by which the fit goes on from where the normal distribution's has ended; markers far
     off then weigh little (torchrod.ekf (6)), and those beyond the 99.9 % point are called outliers. inf: the normal one alone.
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
@@ -156,8 +155,8 @@ def _filter(
     live = ok.nonzero().squeeze(-1)
     sums = Sums.room(len(x), model.size, len(markers.s))
     limits = ekf.Limits(step=settings.step_limit)
-    rough = replace(prepared, model=coarse(model)), limits._replace(decrement=NEAR)
-    near = torch.full((len(x),), not settings.coarse or model.steps <= COARSE_STEPS)
+    rough = replace(prepared, model=model.coarse), limits._replace(decrement=NEAR)
+    near = torch.full((len(x),), not settings.coarse or model.coarse is model)
     course = _Course((at, Sigma0, Q, sums), rough, (prepared, limits), live, near, settings.max_iterations)
     converged, iterations = course.at_once() if prepared.at_once else course.step_by_step()
     status[converged] = int(Status.CONVERGED)

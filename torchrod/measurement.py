@@ -25,6 +25,7 @@ from .robot import Robot
 from .statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table
 from .step import Section
 
+COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
 TIP_EXACT = 10.0  # the covariance of the result takes the tip residual as this much stiffer
@@ -80,6 +81,11 @@ class Model:
     tip: str = "none"
     tension_std: float | None = None
     frame_std: tuple[float, float] | None = None
+
+    @cached_property
+    def coarse(self) -> "Model":
+        """The same with no more than COARSE_STEPS steps along the rod."""
+        return self if self.steps <= COARSE_STEPS else replace(self, steps=COARSE_STEPS)
 
     @property
     def tension_size(self) -> int:

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -11,11 +10,6 @@ from torch import Tensor
 from .lie import Matrix
 
 DTYPE = torch.float64
-
-
-@lru_cache(maxsize=32)  # every scale asks for it
-def _bending_stiffness(K_bt: Matrix, version: int) -> float:
-    return float((K_bt[0, 0] * K_bt[1, 1]).sqrt())
 
 
 @dataclass(frozen=True)
@@ -70,7 +64,7 @@ class Rod:
     @property
     def bending_stiffness(self) -> float:
         """EI (N m^2): the geometric mean of the two bending stiffnesses, the rod's scale of stiffness."""
-        return _bending_stiffness(self.K_bt, self.K_bt._version)
+        return float((self.K_bt[0, 0] * self.K_bt[1, 1]).sqrt())
 
     @property
     def force_scale(self) -> float:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .equilibrium import at_rest, coarse, without_load
+from .equilibrium import at_rest, without_load
 from .measurement import Markers, Model
 from .prepared import Prepared
 
@@ -77,7 +77,7 @@ def better_start(
     cold = cold_start(model, markers.take(index), noise).x if start.cold is None else start.cold[index]
     if start.costs is None:
         part = markers if len(index) == len(start.warm) else markers.take(index)
-        prepared = Prepared(coarse(model), part, model.weights(part, noise))
+        prepared = Prepared(model.coarse, part, model.weights(part, noise))
         costs = torch.stack([prepared.cost(start.x[index]), prepared.cost(cold)], -1)
     else:
         costs = start.costs[index]

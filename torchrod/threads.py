@@ -15,8 +15,8 @@ def kernel_threads() -> int:
 
 
 @contextmanager
-def one_thread(wanted: bool = True) -> Iterator[None]:
-    """Within it torch works on one thread, then as before; not wanted: no difference.
+def one_thread(wanted: bool = True, kernel: bool = False) -> Iterator[None]:
+    """Within it torch works on one thread, then as before; not wanted: no difference. kernel: and so does the kernel.
 
     Small matrices are not worth sharing. Torch's second thread spins for milliseconds after each share, in the way of the kernel's
     own, and beside a busy neighbour it keeps the first waiting for as long.
@@ -25,7 +25,7 @@ def one_thread(wanted: bool = True) -> Iterator[None]:
     if not wanted or before == 1:
         yield
         return
-    token = _before.set(before)
+    token = _before.set(1 if kernel else before)
     torch.set_num_threads(1)
     try:
         yield

@@ -66,7 +66,7 @@ def _builder() -> subprocess.Popen[str] | str:
 
 @functools.lru_cache(maxsize=1)
 def _say_once(reason: str) -> None:
-    warnings.warn(f"the compiled kernel is not available ({reason}); the torch path, about 100 times slower, is used", stacklevel=3)
+    warnings.warn(f"no compiled kernel ({reason}); the torch path, hundreds of times slower, is used", stacklevel=3)
 
 
 @functools.lru_cache(maxsize=1)
