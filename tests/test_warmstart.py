@@ -37,6 +37,7 @@ from torchrod import (
 from torchrod.cli import main
 from torchrod.features import GRID, features, smoothed
 from torchrod.network import digest, load_checkpoint, save_checkpoint
+from torchrod.prepared import Prepared
 from torchrod.status import Learned
 from torchrod.warmstart import shipped
 
@@ -382,3 +383,19 @@ assert not [name for name in sys.modules if name.startswith(("lightning.", "pyto
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_the_costs_of_a_guess_are_the_models(missing):
+    """They come from the forward solves; better_start would otherwise evaluate the model. Also with a noise of each sample's own."""
+    markers, _ = noisy(20)
+    markers = replace(markers, sigma=torch.linspace(0.5e-3, 2e-3, 20))
+    if missing:
+        markers.positions[3, 5:9] = torch.nan
+    model = model_of()
+    start = WarmStart.read(ROD_1)(model, markers, NOISE)
+    prepared = Prepared(model.coarse, markers, model.weights(markers, NOISE))
+    assert start.costs is not None
+    assert start.cold is not None
+    expected = torch.stack([prepared.cost(start.x), prepared.cost(start.cold)], -1)
+    assert torch.allclose(start.costs, expected, rtol=1e-4)
