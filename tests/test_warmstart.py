@@ -387,7 +387,7 @@ assert not [name for name in sys.modules if name.startswith(("lightning.", "pyto
 
 @pytest.mark.parametrize("missing", [False, True])
 def test_the_costs_of_a_guess_are_the_models(missing):
-    """They come from the forward solves; better_start would otherwise evaluate the model. Also with a noise of each sample's own."""
+    """They come from the forward solves; better_start would otherwise evaluate the model. Also with noise of each sample's own."""
     markers, _ = noisy(20)
     markers = replace(markers, sigma=torch.linspace(0.5e-3, 2e-3, 20))
     if missing:
