@@ -22,6 +22,7 @@ from torchrod import (
     paper_settings,
     solve_shape,
 )
+from torchrod.estimator import linearize
 
 
 @pytest.mark.parametrize(
@@ -236,3 +237,15 @@ def test_coordinates_of_your_own_are_fitted_as_well():
     assert bool(own.accepted)
     assert torch.allclose(own.force, known.force, rtol=1e-8)
     assert torch.allclose(own.location, known.location, rtol=1e-8)
+
+
+def test_the_last_update_is_taken_and_the_cost_is_of_the_evaluation_before_it():
+    study, noise = study1(40), 1e-3
+    fit = study.estimate(noise, "contact", noise)
+    positions = study.positions + noise * torch.randn(study.positions.shape, generator=torch.Generator().manual_seed(1))
+    model, markers = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale)), Markers(study.s, positions)
+    at = linearize(model, fit.x, markers, model.weights(markers, noise))
+    gained = fit.cost - at.cost
+    assert -1e-9 < float(gained.min()) < float(gained.max()) < 1e-3, "no more than what counts as converged"
+    assert float(gained.max()) > 2e-4, "and some samples had that left"
+    assert float(at.decrement.max()) < 4e-4
