@@ -37,7 +37,7 @@ def test_every_figure_is_there(made, figures):
             assert set(case[start]) == ROW, (name, start)
         assert {"warm_cold", "warm_cold_95", "warm_oracle", "warm_oracle_95"} == set(case["ratio"])
         assert {"accepted", "location_m", "force_N", "accepted_95", "location_m_95", "force_N_95"} == set(case["difference"])
-        assert set(case["time"]) == {"start_s", "read_s", "cold_s", "solve_s", "iteration_s"}
+        assert set(case["time"]) == {"start_s", "read_s", "cold_s", "solve_s", "network_s", "iteration_s"}
         low, high = case["ratio"]["warm_cold_95"]
         assert low <= case["ratio"]["warm_cold"] <= high, name
     for file in ("warm_start.md", "warm_start.png"):

@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 def canned(estimator: bool = False) -> dict:
     """What a run would have found."""
     batches = [str(b) for b in FULL.batches]
-    at = {"torchrod": 4e-6, "torchrod, eager": 3e-4, "numba": 1e-5, "jax": 8e-5}
+    at = {"torchrod": 4e-6, "torchrod, eager": 3e-4, "numba": 1e-5, "jax": 8e-5, "jax, tuned": 4e-5}
     data = {
         "machine": {
             "processor": "a processor",
@@ -178,7 +178,7 @@ def test_the_kernel_s_share_is_taken_where_torchrod_counts_it(monkeypatch):
     assert timed(lambda: 3, 0.0)["kernel_share"] is None
 
 
-@pytest.mark.parametrize("name", ["numba", "jax"])
+@pytest.mark.parametrize("name", ["numba", "jax", "jax, tuned"])
 def test_a_peer_linearizes_as_torchrod_does(folder, name):
     if not peers.installed(name):
         pytest.skip(f"{name} is not installed; pip install -e '.[bench]' brings it")

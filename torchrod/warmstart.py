@@ -80,20 +80,30 @@ class WarmStart:
             return Start(cold, None, warm)
         everything = len(index) == len(warm)
         part, seen = (read, markers) if everything else (read.take(index), markers.take(index))
-        turn, log_c = turn_of_gamma(part.turn, size // PER_LOAD), torch.full_like(part.amp, prior_log_c(model))
-        prediction = self.network(part.x, part.amp, log_c) if self.predicted_spread else None
-        gamma = self.network.guess(part.x, part.amp, log_c) if prediction is None else prediction.gamma
-        gamma = (turn.mT @ gamma.unsqueeze(-1)).squeeze(-1)
+        gamma, spread = self.guess(model, part)
         rest = at_rest(model, seen, gamma, part.q_tip)
         guessed = model.join(gamma, rest.wrench.nan_to_num(0.0))
         x, costs = cold.index_copy(0, index, guessed), cold.new_zeros(len(cold), 2)
         both = torch.stack([guessed, cold[index]], 1), torch.stack([rest.p, part.p0], 1)
         costs[index] = costs_in_equilibrium(model, seen, noise, *both)
-        if prediction is None:
+        if spread is None:
             return Start(x, None, warm, cold, costs)
         Sigma0 = torch.eye(model.size, dtype=x.dtype).repeat(len(x), 1, 1)
-        Sigma0[index, :size, :size] = turn.mT @ bounded(prediction.covariance) @ turn
+        Sigma0[index, :size, :size] = spread
         return Start(x, Sigma0, warm, cold, costs)
+
+    def guess(self, model: Model, read: Features) -> tuple[Float[Tensor, "B g"], Float[Tensor, "B g g"] | None]:
+        """What the network says of features: gamma, and its covariance if that is to be believed; in the section frame."""
+        turn = turn_of_gamma(read.turn, model.coordinates.size // PER_LOAD)
+        log_c = torch.full_like(read.amp, prior_log_c(model))
+        if not self.predicted_spread:
+            return _turned(turn, self.network.guess(read.x, read.amp, log_c)), None
+        prediction = self.network(read.x, read.amp, log_c)
+        return _turned(turn, prediction.gamma), turn.mT @ bounded(prediction.covariance) @ turn
+
+
+def _turned(turn: Float[Tensor, "B g g"], gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B g"]:
+    return (turn.mT @ gamma.unsqueeze(-1)).squeeze(-1)
 
 
 def bounded(covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:

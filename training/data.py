@@ -21,7 +21,7 @@ import torchrod
 
 from .cases import COLUMNS, Recipe, block
 
-HELD_OUT = 2  # blocks that are not learned from
+HELD_OUT = 50  # of so many blocks one is not learned from, and two at least
 
 
 def make_block(recipe: Recipe, folder: Path, index: int) -> None:
@@ -84,12 +84,13 @@ class ShapeData(LightningDataModule):
             list(tqdm(pool.map(make, missing), total=len(missing), desc="cases", unit="block", delay=1.0))
 
     def setup(self, stage: str) -> None:
-        """Read the blocks; the last HELD_OUT of them are held out."""
+        """Read the blocks; the last of them are held out."""
         if self.train:
             return
         blocks = [load_file(self.folder / f"{i:04d}.safetensors") for i in range(self.recipe.blocks)]
+        last = len(blocks) - max(2, len(blocks) // HELD_OUT)
         self.train, self.held_out = (
-            {name: torch.cat([b[name] for b in part]) for name in COLUMNS} for part in (blocks[:-HELD_OUT], blocks[-HELD_OUT:])
+            {name: torch.cat([b[name] for b in part]) for name in COLUMNS} for part in (blocks[:last], blocks[last:])
         )
 
     def train_dataloader(self) -> DataLoader:

@@ -51,7 +51,7 @@ def _iteration(data: dict[str, Any]) -> list[Bar]:
     """Against numba and JAX."""
     found = []
     for batch in map(str, SHOWN):
-        for theirs, most in (("numba", OF_NUMBA), ("jax", OF_JAX)):
+        for theirs, most in (("numba", OF_NUMBA), ("jax", OF_JAX), ("jax, tuned", OF_JAX)):
             what, bar = f"an iteration, batch {batch}: torchrod / {theirs}", f"<= {most:g}"
             value = data["ratios"]["torchrod"].get(theirs, {}).get(batch)
             if value is None:

@@ -15,9 +15,18 @@ COLOURS = {
     "torchrod, eager": "#7a4b94",
     "numba": "#0a7f8c",
     "jax": "#1b2a41",
+    "jax, tuned": "#4f7cac",
     "scipy": "#8a8d8f",
 }
-MARKS = {"torchrod": "o", "torchrod, compiled": "P", "torchrod, eager": "X", "numba": "D", "jax": "s", "scipy": "^"}
+MARKS = {
+    "torchrod": "o",
+    "torchrod, compiled": "P",
+    "torchrod, eager": "X",
+    "numba": "D",
+    "jax": "s",
+    "jax, tuned": "v",
+    "scipy": "^",
+}
 
 
 def _number(value: float, _: int) -> str:

@@ -136,7 +136,7 @@ def single(processes: dict[str, Process], plan: Plan, folder: Path, progress: Pr
         found["frames"] = {"first_s": seconds[0], "median_s": float(later.median()), "p99_s": float(later.quantile(0.99))}
         found["frames"]["count"] = len(later)
     job = {"job": "estimate", "data": str(write(STUDY, folder)), "batch": 1, "budget": plan.budget}
-    able = {name: process for name, process in processes.items() if name in ("torchrod", "numba", "jax")}
+    able = {name: process for name, process in processes.items() if name in ("torchrod", "numba", "jax, tuned")}
     found["estimate_s"] = {name: answer["seconds"] for name, answer in in_turn(able, plan.rounds, **job).items()}
     return found
 

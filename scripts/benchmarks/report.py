@@ -11,6 +11,7 @@ LABELS = {
     "torchrod, compiled": "torchrod, torch.compile",
     "numba": "numba",
     "jax": "JAX",
+    "jax, tuned": "JAX, tuned",
     "scipy": "scipy `least_squares`",
 }
 MICRO = 1e6

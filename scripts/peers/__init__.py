@@ -19,6 +19,7 @@ import numpy as np
 PEERS = {
     "numba": ("peers.numba_peer", "NumbaPeer", "numba"),
     "jax": ("peers.jax_peer", "JaxPeer", "jax"),
+    "jax, tuned": ("peers.jax_peer", "TunedJaxPeer", "jax"),
     "scipy": ("peers.scipy_peer", "ScipyPeer", "scipy"),
 }
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6  # converged: a step promises to lower the cost by less than this, or this share of it

@@ -1,6 +1,7 @@
-"""The estimator in JAX: jit, vmap over samples, jacfwd of the march, scan over its steps; float64.
+"""The estimator in JAX: jit, vmap over samples, jacfwd, scan over the steps; float64. As one writes it, and tuned.
 
-Only loads and base wrench are differentiated through the march; a registration moves finished points.
+Tuned, only loads and base wrench are differentiated through the march (a registration moves finished points), a batch goes through in
+chunks whose tangents stay in the cache, and every core has a thread that takes them in turn.
 """
 
 # Types are checked where the bench extra is not installed, too.
@@ -20,7 +21,8 @@ from . import DECREMENT, DECREMENT_SHARE, MAX_ITERATIONS, SETTLED, STEP_LIMIT, T
 
 jax.config.update("jax_enable_x64", True)
 
-SIZES = (1, 4, 16, 64)  # samples to a call: a compilation for each; the tangents of the largest still fit the cache
+# Samples to a call: a compilation for each. The tangents of the largest tuned one still fit the cache.
+SIZES, TUNED_SIZES = (1, 16, 256, 4096), (1, 4, 16, 64)
 ROOT_PI = np.sqrt(np.pi)
 Array = Any
 
@@ -96,6 +98,27 @@ class Model:
         tip = y[7:] + jnp.array([-g[-1, 0], -g[-1, 1], 0.0, -g[-1, 3], g[-1, 2], 0.0])
         return p[self.keep - 1], tip
 
+    def placed(self, p: Array, zeta: Array) -> Array:
+        """Points of the rod's own frame, moved by a registration."""
+        return p @ exponential(self.problem.turn * zeta[3:]).T + self.problem.shift * zeta[:3]
+
+    def linearized(self, x: Array) -> tuple[Array, Array]:
+        """h (z,) and H (z, n)."""
+        first = 4 * self.problem.loads
+
+        def both(x: Array) -> tuple[Array, Array]:
+            p, tip = self.march(x[self.marched])
+            p = self.placed(p, x[first : first + 6]) if self.problem.registration else p
+            h = jnp.append(p.ravel(), tip)
+            return h, h
+
+        H, h = jax.jacfwd(both, has_aux=True)(x)
+        return h, H
+
+
+class TunedModel(Model):
+    """The same with the tangents marched only where they need it."""
+
     def linearized(self, x: Array) -> tuple[Array, Array]:
         """h (z,) and H (z, n)."""
         problem, first = self.problem, 4 * self.problem.loads
@@ -107,14 +130,10 @@ class Model:
         (dp, dtip), (p, tip) = jax.jacfwd(both, has_aux=True)(x[self.marched])
         columns = jnp.zeros((p.size, problem.size))
         if problem.registration:
-
-            def moved(zeta: Array) -> Array:
-                return p @ exponential(problem.turn * zeta[3:]).T + problem.shift * zeta[:3]
-
             zeta = x[first : first + 6]
             dp = jnp.einsum("ab,pbt->pat", exponential(problem.turn * zeta[3:]), dp)
-            columns = columns.at[:, first : first + 6].set(jax.jacfwd(moved)(zeta).reshape(-1, 6))
-            p = moved(zeta)
+            columns = columns.at[:, first : first + 6].set(jax.jacfwd(self.placed, 1)(p, zeta).reshape(-1, 6))
+            p = self.placed(p, zeta)
         columns = columns.at[:, self.marched].set(dp.reshape(p.size, -1))
         return jnp.append(p.ravel(), tip), jnp.concatenate([columns, jnp.zeros((6, problem.size)).at[:, self.marched].set(dtip)])
 
@@ -145,10 +164,13 @@ def inverse(A: Array) -> Array:
 
 
 class JaxPeer:
-    """The estimator of one problem; every shape is compiled on first use."""
+    """The estimator of one problem, as one writes it; every shape is compiled on first use."""
+
+    kind: type[Model] = Model
+    sizes, threads = SIZES, 1
 
     def __init__(self, problem: Problem):
-        self.problem, self.model = problem, Model(problem)
+        self.problem, self.model = problem, self.kind(problem)
         self.mean, self.precision = jnp.asarray(problem.prior_mean), jnp.asarray(problem.prior_precision)
         self._linearize = jax.jit(jax.vmap(self.model.linearized))
         self._iterate = jax.jit(jax.vmap(self._pass))
@@ -184,12 +206,12 @@ class JaxPeer:
         return inverse(self._information(x, h, H, z, w.at[-6:].multiply(TIP_EXACT))[0])
 
     def _in_chunks(self, function: Any, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        """A compiled function over all samples; a thread for every core takes chunks in turn. The last chunk is filled up."""
+        """A compiled function over all samples; every thread takes chunks in turn. The last chunk is filled up."""
         B = len(arrays[0])
-        size = next((size for size in SIZES if size >= B), SIZES[-1])
+        size = next((size for size in self.sizes if size >= B), self.sizes[-1])
         parts = [tuple(a[i : i + size] for a in arrays) for i in range(0, B, size)]
         parts = [tuple(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]) for a in part) for part in parts]
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        with ThreadPoolExecutor(self.threads) as pool:
             done = list(pool.map(lambda part: [np.asarray(a) for a in function(*part)], parts))
         return tuple(np.concatenate(outs)[:B] for outs in zip(*done, strict=True))
 
@@ -225,3 +247,10 @@ class JaxPeer:
                 break
         (covariance,) = self._in_chunks(lambda *part: [self._covariance(*part)], x, z, w)
         return make_fit(self.problem, x, covariance, iterations, converged, cost)
+
+
+class TunedJaxPeer(JaxPeer):
+    """The same, made as fast as we know how."""
+
+    kind = TunedModel
+    sizes, threads = TUNED_SIZES, len(os.sched_getaffinity(0))
