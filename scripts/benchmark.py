@@ -23,6 +23,7 @@ from benchmarks.measure import (
     estimates,
     first_calls,
     growth,
+    linearity,
     machine,
     memory,
     single,
@@ -47,6 +48,7 @@ def measured(names: list[str], plan: Plan, folder: Path, caches: Path) -> dict[s
             say("the same answers?")
             data["agreement"] = checked(processes, folder)
             data["iteration"] = by_batch(processes, plan, folder, say)
+            data["linear"] = linearity(processes, plan, folder, say)
             data["growth"] = growth(processes, plan, folder, say)
             data["estimates"] = estimates(processes, plan, folder, say)
             data["single"] = single(processes, plan, folder, say)

@@ -27,7 +27,7 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("benchmark")
 
 
-def canned(estimator: bool = False) -> dict:
+def canned() -> dict:
     """What a run would have found."""
     batches = [str(b) for b in FULL.batches]
     at = {"torchrod": 4e-6, "torchrod, eager": 3e-4, "numba": 1e-5, "jax": 8e-5, "jax, tuned": 4e-5}
@@ -41,11 +41,15 @@ def canned(estimator: bool = False) -> dict:
         },
         "iteration": {name: {b: t * (1 + 20 / int(b)) for b in batches} for name, t in at.items()} | {"scipy": {"1": 1e-2}},
         "growth": {w: {"torchrod": {str(v): 1e-6 * v for v in getattr(FULL, w)}} for w in ("steps", "markers", "loads")},
+        "linear": {"torchrod": {str(b): 4e-6 for b in FULL.linear}},
         "cores": {"torchrod": {"1": 8e-6, "2": 4e-6}},
         "memory": {"256": {"peak": 6e8, "before": 5e8, "seconds": 0.1}, "65536": {"peak": 9e8, "before": 5e8, "seconds": 10.0}},
         "command_line": {"command_s": 3.0, "import_s": 1.5},
         "first_call": {"numba, cached": {"import_s": 0.4, "first_s": 0.1}},
-        "single": {"frames": None, "estimate_s": {"torchrod": 2e-2, "numba": 5e-4}},
+        "single": {
+            "frames": {"first_s": 0.1, "median_s": 2e-3, "p99_s": 5e-3, "count": 400},
+            "estimate_s": {"torchrod": 2e-2, "numba": 5e-4},
+        },
     }
     row = {"batch": 4096, "seconds": 1e-4, "iterations": 7.2, "converged": 1.0, "kernel_share": None}
     data["estimates"] = {"torchrod, cold": row, "torchrod, warm": row | {"seconds": 2e-4, "kernel_share": 0.75}, "numba, cold": row}
@@ -61,15 +65,13 @@ def canned(estimator: bool = False) -> dict:
         "converged": 1.0,
     }
     data["agreement"] = {"numba": same | {"samples": 64}}
-    if estimator:
-        data["single"]["frames"] = {"first_s": 0.1, "median_s": 2e-3, "p99_s": 5e-3, "count": 400}
     data["ratios"] = ratios(data)
     data["bars"] = bars(data)
     return data
 
 
 def test_ratios_and_bars():
-    data = canned(estimator=True)
+    data = canned()
     assert data["ratios"]["torchrod"]["numba"]["256"] == pytest.approx(0.4)
     met = {bar["what"]: bar["met"] for bar in data["bars"]}
     assert met["an iteration, batch 4096: torchrod / numba"] is True
@@ -80,19 +82,32 @@ def test_ratios_and_bars():
     assert met["one frame, 99 % point / median"] is False
     assert met["the command line on one shape, cold process"] is True
     assert met["peak memory (batch 65536)"] is True
+    linear = "time per sample, batches 256 to 65536: largest / smallest"
+    assert met[linear] is True
+    data["linear"]["torchrod"]["4096"] *= 1.11
+    assert {bar["what"]: bar["met"] for bar in bars(data)}[linear] is False
+
+
+def test_a_share_of_work_is_the_same_in_batches_of_every_size(folder, monkeypatch):
+    worker, path = Worker("torchrod"), str(write(ITERATION, folder))
+    assert worker.share(path, 16, 64)["seconds"] > 0
+    calls = []
+    monkeypatch.setattr("benchmarks.worker.clocked", lambda once: calls.append(once()) or 0.5)
+    assert worker.share(path, 16, 64)["seconds"] == 2.0 and len(calls) == 4
+    assert worker.share(path, 64, 64)["seconds"] == 0.5
 
 
 def test_what_was_not_measured_is_said():
     data = canned()
     unknown = {bar["what"] for bar in data["bars"] if bar["met"] is None}
-    assert {"one frame, median after the first", "whole estimates, cold, batch 4096: share of time outside the kernel"} <= unknown
+    assert unknown == {"whole estimates, cold, batch 4096: share of time outside the kernel"}
     del data["iteration"]["numba"]
     data["ratios"] = ratios(data)
     assert any(bar["what"].endswith("torchrod / numba") and bar["met"] is None for bar in bars(data))
 
 
 def test_page_and_figure(tmp_path):
-    data = json.loads(json.dumps(canned(estimator=True)))
+    data = json.loads(json.dumps(canned()))
     page = tmp_path / "performance.md"
     page.write_text(f"prose before\n{BEGIN}\nold\n{END}\nprose after\n")
     write_page(page, generated(data, " --quick"))
@@ -155,7 +170,7 @@ def test_scipy_fits_as_torchrod_does(folder):
     assert off["force"] < 5e-3 and off["location"] < 2e-4 and off["elsewhere"] == 0 and off["converged"] == 1
 
 
-def test_frames_go_through_an_estimator_once_torchrod_has_one(folder, monkeypatch):
+def test_frames_go_through_an_estimator(folder, monkeypatch):
     worker = Worker("torchrod")
     film = str(write_frames(3, folder))
 

@@ -122,10 +122,14 @@ def fully_iterated(model: Model, markers: Markers, noise: float, x: Tensor) -> T
 
 
 def excess(part: Part, fit: Estimate) -> Tensor:
-    """By how much (B,) the fits that converged lie above the cost they would reach; NaN where they did not converge."""
+    """By how much (B,) the answers of fits that converged lie above the cost they would reach; NaN where they did not converge."""
     x = torch.where(torch.isfinite(fit.x), fit.x, part.oracle)
-    cost = [fully_iterated(part.model, part.markers.take(i), part.noise, x[i]) for i in chunks(len(x))]
-    return torch.where(fit.status == Status.CONVERGED, fit.chi2 - torch.cat(cost), torch.nan)
+    above = []
+    for i in chunks(len(x)):
+        markers = part.markers.take(i)
+        reached = Prepared(part.model, markers, part.model.weights(markers, part.noise)).cost(x[i])
+        above.append(reached - fully_iterated(part.model, markers, part.noise, x[i]))
+    return torch.where(fit.status == Status.CONVERGED, torch.cat(above), torch.nan)
 
 
 def _joined(case: Case, fits: list[Estimate], seconds: tuple[float, float], check: bool) -> Run:
@@ -260,6 +264,10 @@ def compared(case: Case, by_start: dict[str, Run]) -> dict[str, Any]:
         figures["difference"] |= {name: float(values[k].nanmean()), f"{name}_95": interval(means[:, k])}
     above = warm.chi2 - cold.chi2
     figures |= {"worse": float((above > WORSE).double().mean()), "better": float((above < -WORSE).double().mean())}
+    same = above.abs() <= WORSE
+    figures["same_minimum"] = {"share": float(same.double().mean())}
+    for k, name in enumerate(("location_m", "force_N"), 4):
+        figures["same_minimum"][name] = float(values[k][same].nanmean())
     figures["above_max"] = float(above.nan_to_num(0.0).max())
     figures["convergence"] = {name: remaining(by_start[name]) for name in ("cold", "warm")}
     return figures | {"cases": len(cold.chi2), "in_distribution": case.in_distribution, "bar": case.bar, "title": case.title}

@@ -159,8 +159,14 @@ def _slower(f: dict[str, Any]) -> float:
 
 
 def _share(key: str) -> Callable[[dict[str, Any]], str]:
-    """How much an error changes, over the cold start's mean error."""
-    return lambda f: f" ({100 * f['difference'][key] / f['cold'][f'{key}_mean']:+.2f} %)"
+    """How much an error changes, over the cold start's mean error; and where both starts end in one minimum, if not all do."""
+
+    def note(f: dict[str, Any]) -> str:
+        whole, same = (100 * f[which][key] / f["cold"][f"{key}_mean"] for which in ("difference", "same_minimum"))
+        of_same = "" if f["same_minimum"]["share"] == 1 else f"; {same:+.2f} % where both end in the same minimum"
+        return f" ({whole:+.2f} %{of_same})"
+
+    return note
 
 
 def findings(data: dict[str, Any]) -> list[str]:
@@ -200,14 +206,14 @@ OUTCOMES = f"""Cold / warm / oracle. Mean |error|, contacts matched by location;
 load carried up to s. Dearer, cheaper: the share of samples whose warm fit ends more than {WORSE} in chi^2 above or below the
 cold one.
 """
-COSTS = f"""Left to gain: what up to {FURTHER} further Gauss-Newton iterations take off chi^2 of the fits that had converged: the
+COSTS = f"""Left to gain: what up to {FURTHER} further Gauss-Newton iterations take off chi^2 of the answers that had converged: the
 largest / the 99 % point / the largest of accepted fits. (A fit that cannot explain the data has also converged when it would gain
 less than 1e-6 of its chi^2, which may be more than {WORSE}.)
 
 Times: CPU time of one thread, batch of {TIMED_BATCH}, the fastest of nine calls; guess and check: reading the markers, for
 which the robot without the load must be known (a cold start), the network, the forward solve under its loads, which is where alpha
-comes from, and the cost of both. All the guess adds: guess and check less a cold start. Whole batch, cold / warm / oracle: the
-fastest of {REPEATS} runs, everything included (the oracle gets its start for nothing).
+comes from, and the cost of both; network and check: timed by themselves. All the guess adds: guess and check less a cold start.
+Whole batch, cold / warm / oracle: the fastest of {REPEATS} runs, everything included (the oracle gets its start for nothing).
 """
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -97,6 +98,22 @@ def growth(processes: dict[str, Process], plan: Plan, folder: Path, progress: Pr
     return found
 
 
+def linearity(processes: dict[str, Process], plan: Plan, folder: Path, progress: Progress) -> dict[str, dict[str, float]]:
+    """Seconds per sample and iteration, by path and batch: medians over rounds in which every batch does the same work in turn.
+
+    The fastest of several calls, which serves elsewhere, would favour short ones: they fit between two disturbances.
+    """
+    able = {name: process for name, process in processes.items() if name in ("torchrod", "numba")}
+    data, taken = str(write(ITERATION, folder)), {name: {str(batch): [] for batch in plan.linear} for name in able}
+    for k in range(plan.linear_rounds):
+        progress(f"the same work in batches of every size, round {k + 1}")
+        for batch in plan.linear:
+            for name, process in able.items():
+                answer = process.ask("share", data=data, batch=batch, samples=plan.linear_samples)
+                taken[name][str(batch)].append(answer["seconds"] / plan.linear_samples)
+    return {name: {batch: statistics.median(values) for batch, values in of.items()} for name, of in taken.items()}
+
+
 def by_cores(names: list[str], plan: Plan, folder: Path, caches: Path, progress: Progress) -> dict[str, dict[str, float]]:
     """Seconds per sample and iteration, by path and number of cores."""
     data, found = str(write(ITERATION, folder)), {name: {} for name in names if name in plan.growing}
@@ -127,18 +144,15 @@ def estimates(processes: dict[str, Process], plan: Plan, folder: Path, progress:
 
 
 def single(processes: dict[str, Process], plan: Plan, folder: Path, progress: Progress) -> dict[str, Any]:
-    """One sample: frames through torchrod.Estimator (None while there is none), and whole estimates of a batch of one."""
+    """One sample: frames through torchrod.Estimator, and whole estimates of a batch of one."""
     progress("single frames")
     seconds = processes["torchrod"].ask("frames", data=str(write_frames(plan.frames, folder)))["seconds"]
-    found: dict[str, Any] = {"frames": None}
-    if seconds is not None:
-        later = torch.tensor(seconds[1:], dtype=torch.float64)
-        found["frames"] = {"first_s": seconds[0], "median_s": float(later.median()), "p99_s": float(later.quantile(0.99))}
-        found["frames"]["count"] = len(later)
+    later = torch.tensor(seconds[1:], dtype=torch.float64)
+    frames = {"first_s": seconds[0], "median_s": float(later.median()), "p99_s": float(later.quantile(0.99)), "count": len(later)}
     job = {"job": "estimate", "data": str(write(STUDY, folder)), "batch": 1, "budget": plan.budget}
     able = {name: process for name, process in processes.items() if name in ("torchrod", "numba", "jax, tuned")}
-    found["estimate_s"] = {name: answer["seconds"] for name, answer in in_turn(able, plan.rounds, **job).items()}
-    return found
+    alone = {name: answer["seconds"] for name, answer in in_turn(able, plan.rounds, **job).items()}
+    return {"frames": frames, "estimate_s": alone}
 
 
 def first_calls(names: list[str], plan: Plan, folder: Path, caches: Path, progress: Progress) -> dict[str, dict[str, float]]:

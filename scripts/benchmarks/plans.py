@@ -11,7 +11,8 @@ class Plan:
 
     rounds: how often every path is asked in turn; budget: seconds that a timing takes. largest: the largest batch of a path that is
     slow. growing: the paths whose growth is measured, at `growth_batch` samples. estimates: how many whole estimates of a path are
-    timed at once, "" for the others.
+    timed at once, "" for the others. linear: batches whose time per sample is compared, over `linear_samples` samples each, in
+    turn, `linear_rounds` times.
     """
 
     batches: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384, 65536)
@@ -24,6 +25,9 @@ class Plan:
     markers: tuple[int, ...] = (5, 10, 20, 40)
     loads: tuple[int, ...] = (1, 2, 3, 4)
     core_batch: int = 4096
+    linear: tuple[int, ...] = (256, 1024, 4096, 16384, 65536)
+    linear_samples: int = 65536
+    linear_rounds: int = 9
     estimates: dict[str, int] = field(default_factory=lambda: {"torchrod, eager": 256, "scipy": 4, "": 4096})
     memory: tuple[int, ...] = (256, 4096, 65536)
     frames: int = 400
@@ -46,6 +50,9 @@ QUICK = Plan(
     markers=(10, 20, 40),
     loads=(1, 2, 3),
     core_batch=1024,
+    linear=(256, 1024, 4096),
+    linear_samples=4096,
+    linear_rounds=5,
     estimates={"torchrod, eager": 0, "scipy": 1, "": 1024},
     memory=(256, 1024),
     frames=120,

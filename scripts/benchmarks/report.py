@@ -104,10 +104,8 @@ def generated(data: dict[str, Any], options: str) -> str:
     rate = ", ".join(f"{r / 1e9:.0f} Gflop/s on {n}" for n, r in m["dgemm"].items())
     one = ", ".join(f"{label(name)} {1e3 * s:.2f} ms" for name, s in single["estimate_s"].items())
     frames = single["frames"]
-    film = "not measured: torchrod has no `Estimator` yet"
-    if frames is not None:
-        film = f"first {1e3 * frames['first_s']:.2f} ms, then median {1e3 * frames['median_s']:.2f} ms, "
-        film += f"99 % point {1e3 * frames['p99_s']:.2f} ms ({frames['count']} frames)"
+    film = f"first {1e3 * frames['first_s']:.2f} ms, then median {1e3 * frames['median_s']:.2f} ms, "
+    film += f"99 % point {1e3 * frames['p99_s']:.2f} ms ({frames['count']} frames)"
     lines = [
         f"Made by `python scripts/benchmark.py{options}` on {m['processor']}, {m['cores']} cores; all of it comes from that run.",
         "",
@@ -121,7 +119,8 @@ def generated(data: dict[str, Any], options: str) -> str:
         "",
         *times_table("batch", data["iteration"]),
     ]
-    lines += ["", *ratio_table(data), "", "Growth, microseconds per sample:"]
+    lines += ["", *ratio_table(data), "", "The same samples in calls of every size, in turn (medians; above: the fastest call):"]
+    lines += ["", *times_table("batch", data["linear"]), "", "Growth, microseconds per sample:"]
     for what, by_path in data["growth"].items():
         lines += ["", *times_table(what, by_path)]
     lines += ["", *times_table("cores", data["cores"]), "", "### Whole estimates", ""]

@@ -54,20 +54,35 @@ class Worker:
 
     def iteration(self, data: str, batch: int, budget: float) -> dict[str, Any]:
         """Seconds of one iteration of the whole batch."""
+        once, as_given = self._iteration(data, batch)
+        found = timed(once, budget, before=as_given)
+        return {name: value for name, value in found.items() if name != "value"}
+
+    def share(self, data: str, batch: int, samples: int) -> dict[str, Any]:
+        """Seconds of an iteration of so many samples in calls of `batch`, all calls together: no batch may pick its best moment."""
+        once, as_given = self._iteration(data, batch)
+        as_given()
+        once()
+        seconds = 0.0
+        for _ in range(samples // batch):
+            as_given()
+            seconds += clocked(once)
+        return {"seconds": seconds}
+
+    def _iteration(self, data: str, batch: int) -> tuple[Callable[[], object], Callable[[], None]]:
+        """An iteration of the whole batch, and what puts it back to its beginning."""
         peer, arrays = self.case(data)
         x, positions = repeated(arrays["near"], batch), repeated(arrays["positions"], batch)
-        Sigma, cap = np.tile(np.eye(x.shape[1]), (batch, 1, 1)), np.full(batch, np.inf)
         if self.name == "scipy":  # has no iteration of its own: h and H are nearly all of it
-            return timed(lambda: peer.linearize(x), budget)
-        given = x, Sigma, cap
+            return lambda: peer.linearize(x), lambda: None
+        given = x, np.tile(np.eye(x.shape[1]), (batch, 1, 1)), np.full(batch, np.inf)
         state = tuple(a.copy() for a in given)
 
         def as_given() -> None:
             for a, b in zip(state, given, strict=True):
                 np.copyto(a, b)
 
-        found = timed(lambda: peer.iterate(*state, positions), budget, before=as_given)
-        return {name: value for name, value in found.items() if name != "value"}
+        return lambda: peer.iterate(*state, positions), as_given
 
     def estimate(self, data: str, batch: int, budget: float, start: str = "cold") -> dict[str, Any]:
         """Seconds of whole estimates of the batch, and the share of torchrod's that is not spent in its kernel."""
@@ -84,11 +99,9 @@ class Worker:
         return found | {"converged": float((fit.status == 0).double().mean()), "iterations": float(fit.iterations.double().mean())}
 
     def frames(self, data: str) -> dict[str, Any]:
-        """Seconds of each frame of a film, through an estimator that lives on; None while torchrod has none."""
+        """Seconds of each frame of a film, through an estimator that lives on."""
         peer, arrays = self.case(data)
         frame = peer.frame_estimator()
-        if frame is None:
-            return {"seconds": None}
         return {"seconds": [clocked(lambda seen=seen: frame(seen)) for seen in arrays["positions"]]}
 
     def answers(self, data: str, out: str, samples: int, fits: bool) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The estimator in JAX: jit, vmap over samples, jacfwd, scan over the steps; float64. As one writes it, and tuned.
 
-Tuned, only loads and base wrench are differentiated through the march (a registration moves finished points), a batch goes through in
-chunks whose tangents stay in the cache, and every core has a thread that takes them in turn.
+Tuned, only loads and base wrench are differentiated through the march (a registration moves finished points), a batch goes through
+in chunks whose tangents stay in the cache, and every core has a thread that takes them in turn.
 """
 
 # Types are checked where the bench extra is not installed, too.
