@@ -1,12 +1,25 @@
-"""The reference data's two homes, and float64 everywhere."""
+"""The reference data's two homes, float64 everywhere, and what is left out where there is no compiled kernel."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 import torch
 
+from torchrod import fast
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "third_party"
+
+
+def pytest_collection_modifyitems(items):
+    """Without the kernel a fit takes hundreds of times longer: tests of many of them would take hours."""
+    if os.environ.get("TORCHROD_EVERY") or fast.library(wait=True) is not None:
+        return
+    reason = "no kernel here, and its fits take minutes by the torch path; TORCHROD_EVERY=1 runs it all the same"
+    for item in items:
+        if item.get_closest_marker("many_fits"):
+            item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(autouse=True)
