@@ -17,8 +17,10 @@ from torchrod import (
     PointCoordinates,
     PointForces,
     Settings,
+    Start,
     Status,
     estimate,
+    estimator,
     paper_settings,
     solve_shape,
 )
@@ -249,3 +251,19 @@ def test_the_last_update_is_taken_and_the_cost_is_of_the_evaluation_before_it():
     assert -1e-9 < float(gained.min()) < float(gained.max()) < 1e-3, "no more than what counts as converged"
     assert float(gained.max()) > 2e-4, "and some samples had that left"
     assert float(at.decrement.max()) < 4e-4
+
+
+def test_a_start_is_handed_out_chunk_by_chunk(monkeypatch):
+    """Known starts, of samples that the estimator takes a few at a time, and one too few."""
+    study = study1(7)
+    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
+    markers = Markers(study.s, study.positions + 1e-3 * torch.randn(7, 20, 3, generator=torch.Generator().manual_seed(2)))
+    whole = estimate(model, markers, 1e-3)
+    start = Start.known(whole.x)
+    monkeypatch.setattr(estimator, "CHUNK", 3)
+    monkeypatch.setattr(estimator, "CHUNK_TORCH", 3)
+    again = estimate(model, markers, 1e-3, start=start)
+    assert (again.iterations <= 2).all() and not again.warm_started.any()
+    assert torch.allclose(again.force, whole.force, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="start has 6 samples and the markers have 7"):
+        estimate(model, markers, 1e-3, start=start.take(torch.arange(6)))

@@ -45,6 +45,15 @@ def test_a_block_is_a_pure_function_of_its_recipe(recipe, inputs):
     assert (eta.diff(dim=-1) >= 0).all(), "loads from the base to the tip"
 
 
+def test_a_block_may_be_larger_than_a_chunk_of_the_estimator(monkeypatch):
+    """Where there is no kernel, or it is still being built, chunks are smaller than the blocks of the shipped recipes."""
+    whole = block(SMALL, 0)
+    monkeypatch.setattr("torchrod.estimator.CHUNK", 40)
+    monkeypatch.setattr("torchrod.estimator.CHUNK_TORCH", 40)
+    parts = block(SMALL, 0)
+    assert all(torch.allclose(whole[name], parts[name], rtol=1e-4, atol=1e-5) for name in whole)
+
+
 def test_the_tendons_stay_soft():
     """So that the strain balance needs few steps: otherwise the cases take minutes instead of seconds."""
     recipe = replace(SMALL, tendons=(1, 3), weight=1.0)

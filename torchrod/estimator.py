@@ -220,7 +220,7 @@ class _Chunk:
             part = replace(self.take(index), settings=hasty)
             gamma = coordinates.rescaled(fit.x[index, : coordinates.size], factor)
             x = in_equilibrium(self.model, gamma, part.markers)
-            fit = fit.improved_by(part.filtered(Start(x, None, torch.zeros(len(x), dtype=torch.bool))), index)
+            fit = fit.improved_by(part.filtered(Start.known(x)), index)
         return fit
 
 
@@ -245,19 +245,21 @@ def estimate(
     markers: Markers,
     noise: float,
     settings: Settings | None = None,
-    start: StartRule = cold_start,
+    start: StartRule | Start = cold_start,
     progress: Callable[[int], object] = _silent,
 ) -> Estimate:
     """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
 
     noise: standard deviation of a marker coordinate (m), where markers.sigma does not have one for each sample.
-    start: where to start, from (model, markers, noise); a guess that is no nearer to the data than a cold start is dropped, and one
-    that leads to no accepted fit is followed by a cold start.
+    start: where to start, or a rule that says so from (model, markers, noise) of some of the samples; a guess that is no nearer to
+    the data than a cold start is dropped, and one that leads to no accepted fit is followed by a cold start.
     progress: called as samples finish, with their number. A sample's answer does not depend on its batch.
     Errors: ValueError for markers that do not fit the robot; a sample that cannot be estimated is reported by its status.
     Source: the paper, section II; DESIGN.md section 3.
     """
     check(model, markers, noise)
+    if isinstance(start, Start) and len(start.x) != len(markers.positions):
+        raise ValueError(f"start has {len(start.x)} samples and the markers have {len(markers.positions)}; give one for each")
     parts = []
     compiled = served(model, markers.positions)
     size = CHUNK if compiled else CHUNK_TORCH
@@ -265,7 +267,8 @@ def estimate(
         for first in range(0, len(markers.positions), size):
             index = torch.arange(first, min(first + size, len(markers.positions)))
             chunk = _Chunk(model, markers.take(index), noise, settings or Settings())
-            parts.append(_fitted(chunk, start(model, chunk.markers, noise), progress))
+            begin = start.take(index) if isinstance(start, Start) else start(model, chunk.markers, noise)
+            parts.append(_fitted(chunk, begin, progress))
     return Estimate.cat(parts)
 
 

@@ -83,7 +83,8 @@ def estimate_noise(
     Give a fit to those markers to Noise.judged. Errors: ValueError as torchrod.estimate.
     """
     L, settings = model.robot.rod.length, replace(settings or Settings(), restarts=())
-    sigma, begin = torch.full((len(markers.positions),), FIRST * L, dtype=torch.float64), start
+    sigma = torch.full((len(markers.positions),), FIRST * L, dtype=torch.float64)
+    begin: StartRule | Start = start
     nu = torch.zeros_like(sigma)
     for _ in range(ROUNDS):
         known = replace(markers, sigma=sigma)
@@ -94,7 +95,7 @@ def estimate_noise(
         sigma = torch.maximum(found.where(torch.isfinite(found), sigma), 0.02 * sigma)
         if moved < SETTLED:
             break
-        begin = _onward(fit)
+        begin = Start(fit.x, None, torch.isfinite(fit.x).all(-1))
     known = nu > 0
     std = torch.where(sigma > LEAST * L, sigma / (2 * nu.clamp(min=1)).sqrt(), 0.0)
     noise = Noise(sigma.where(known, torch.nan), std.where(known, torch.nan), nu)
@@ -123,16 +124,3 @@ def estimate_noise_among(
         assert by_other.sigma is not None
         known = replace(known, sigma=torch.where(swap, by_other.sigma, known.sigma))
     return noise, known
-
-
-def _onward(fit: Estimate) -> StartRule:
-    """From where the last round ended, chunk after chunk."""
-    taken = 0
-
-    def rule(model: Model, markers: Markers, noise: float) -> Start:
-        nonlocal taken
-        x = fit.x[taken : taken + len(markers.positions)]
-        taken += len(x)
-        return Start(x, None, torch.isfinite(x).all(-1))
-
-    return rule

@@ -156,7 +156,7 @@ def _simplified(
             continue
         model, part = hypotheses[fewer].model, markers.take(index)
         x = _with_one_less(fit.x[index], hypotheses[more].model, model, dropped)
-        other = estimate(model, part, noise, settings, _from(Start(x, None, torch.ones_like(index, dtype=torch.bool))))
+        other = estimate(model, part, noise, settings, Start(x, None, torch.ones_like(index, dtype=torch.bool)))
         again = bic(other, model, part)
         lower = again < scores[index, more]
         fit = _replaced(fit, other, index, lower)
@@ -234,7 +234,7 @@ def _needed(
     noise: float,
     rule: StartRule,
     foreseen: Float[Tensor, " B"],
-) -> tuple[Int[Tensor, " b"], StartRule]:
+) -> tuple[Int[Tensor, " b"], StartRule | Start]:
     """The samples that a hypothesis is to be fitted to, and from where: the fit of the same kind with one contact less, if any.
 
     foreseen: takes the BIC that its score test promises.
@@ -255,23 +255,10 @@ def _needed(
     wanted = sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)
     rows = wanted.nonzero().squeeze(-1)
     begin = start_with_one_more(hypothesis.model, found.take(rows))
-    return index[rows], _from(begin) if hypothesis.contacts > 1 else rule
+    return index[rows], begin if hypothesis.contacts > 1 else rule
 
 
 def same_kind(a: Model, b: Model) -> bool:
     """Whether two models differ in the number of loads only; a model without loads has no width prior to differ in."""
     alike = getattr(a.coordinates, "prior_name", "") == getattr(b.coordinates, "prior_name", "") or not a.coordinates.size
     return a.tip == b.tip and alike
-
-
-def _from(begin: Start) -> StartRule:
-    """The rule that hands out `begin`, chunk after chunk."""
-    taken = 0
-
-    def rule(model: Model, markers: Markers, noise: float) -> Start:
-        nonlocal taken
-        rows = slice(taken, taken + len(markers.positions))
-        taken = rows.stop
-        return Start(begin.x[rows], None, begin.warm[rows])
-
-    return rule

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .equilibrium import at_rest, without_load
@@ -26,6 +26,16 @@ class Start:
     warm: Bool[Tensor, " B"]
     cold: Float[Tensor, "B n"] | None = None
     costs: Float[Tensor, "B 2"] | None = None
+
+    @classmethod
+    def known(cls, x: Float[Tensor, "B n"]) -> "Start":
+        """To be begun from whatever a cold start would cost."""
+        return cls(x, None, torch.zeros(len(x), dtype=torch.bool))
+
+    def take(self, index: Int[Tensor, " b"]) -> "Start":
+        """The samples of an index."""
+        Sigma0, cold, costs = (None if part is None else part[index] for part in (self.Sigma0, self.cold, self.costs))
+        return Start(self.x[index], Sigma0, self.warm[index], cold, costs)
 
 
 StartRule = Callable[[Model, Markers, float], Start]

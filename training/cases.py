@@ -196,10 +196,8 @@ def in_order(gamma: Float[Tensor, "B n"], M: Float[Tensor, "B n n"]) -> tuple[Te
 def answered(model: Model, markers: Markers, noise: float, gamma: Float[Tensor, "B n"], iterations: int) -> Float[Tensor, "B n"]:
     """x after so many iterations of the filter from a truth gamma. The start counts as cold: the answer is wanted as it is."""
 
-    def at_truth(model: Model, markers: Markers, noise: float) -> Start:
-        x = in_equilibrium(model, gamma, markers)
-        return Start(torch.where(x.isnan(), cold_start(model, markers, noise).x, x), None, torch.zeros(len(x), dtype=torch.bool))
-
+    x = in_equilibrium(model, gamma, markers)
+    at_truth = Start.known(torch.where(x.isnan(), cold_start(model, markers, noise).x, x))
     return estimate(model, markers, noise, Settings(max_iterations=iterations, restarts=()), at_truth).x
 
 

@@ -49,26 +49,19 @@ class Run:
     seconds: tuple[float, float]
 
 
-def given(x: Tensor) -> StartRule:
-    """A start that is known: the filter begins there, whatever a cold start would cost."""
-    return lambda model, markers, noise: Start(x, None, torch.zeros(len(x), dtype=torch.bool))
-
-
-def rules(part: Part) -> dict[str, Callable[[Tensor], StartRule]]:
-    """How to start the samples of an index. Where no checkpoint serves the model, warm is cold, as in the command line."""
-    warm = find_warm_start(part.model) or cold_start
-    return {"cold": lambda _: cold_start, "warm": lambda _: warm, "oracle": lambda index: given(part.oracle[index])}
+def starts(part: Part) -> dict[str, StartRule | Start]:
+    """Where to start. Where no checkpoint serves the model, warm is cold, as in the command line."""
+    return {"cold": cold_start, "warm": find_warm_start(part.model) or cold_start, "oracle": Start.known(part.oracle)}
 
 
 def chunks(count: int) -> list[Tensor]:
-    """Indices by the estimator's own chunks: the oracle must know which samples it is asked for."""
+    """Indices by the estimator's own chunks, whose working set is small enough."""
     return list(torch.arange(count).split(CHUNK if available() else CHUNK_TORCH))
 
 
-def fitted(part: Part, rule: Callable[[Tensor], StartRule]) -> Estimate:
+def fitted(part: Part, start: StartRule | Start) -> Estimate:
     """All samples of a part from one start."""
-    indices = chunks(len(part.oracle))
-    return Estimate.cat([estimate(part.model, part.markers.take(i), part.noise, start=rule(i)) for i in indices])
+    return estimate(part.model, part.markers, part.noise, start=start)
 
 
 def centroid(load: Load) -> Tensor:
@@ -152,7 +145,7 @@ def _joined(case: Case, fits: list[Estimate], seconds: tuple[float, float], chec
 
 def runs(case: Case, progress: Callable[[], object]) -> dict[str, Run]:
     """The case from every start, the starts in turn, so that a busy machine slows all alike."""
-    by_part = [rules(part) for part in case.parts]
+    by_part = [starts(part) for part in case.parts]
     fits: dict[str, list[Estimate]] = {}
     seconds = dict.fromkeys(STARTS, (float("inf"), float("inf")))
     for _ in range(REPEATS):
@@ -172,7 +165,7 @@ def start_times(part: Part) -> dict[str, float]:
     """
     model, noise = part.model, part.noise
     markers = part.markers.take(torch.arange(TIMED_BATCH) % len(part.oracle))
-    warm, w = rules(part)["warm"](torch.arange(0)), model.weights(markers, noise)
+    warm, w = find_warm_start(model) or cold_start, model.weights(markers, noise)
     x = part.oracle[torch.arange(TIMED_BATCH) % len(part.oracle)]
     Sigma0, Q = Settings().initial_covariance(x), torch.ones(model.size, dtype=x.dtype)
     many, none = Sigma0.repeat(len(x), 1, 1), torch.zeros(len(x), dtype=torch.bool)
