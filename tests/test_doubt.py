@@ -115,6 +115,25 @@ def test_the_noise_is_found_without_knowing_the_number_of_loads():
         assert torch.equal(known.sigma, noise.sigma)
 
 
+def test_outliers_of_a_model_with_too_few_loads_do_not_tell_the_noise():
+    """A robust fit without a load calls most markers outliers; what those leave is little, and no noise."""
+    p = drawn()[0][:20]
+    robot = steel_rod()
+    models = [Model(robot, GaussianCoordinates(k, 0.4, robot.rod.force_scale)) for k in range(3)]
+    noise, _ = estimate_noise_among(models, Markers(S, p), Settings(robust=10.0))
+    assert noise.freedom.min() > 40
+    assert 0.9 < (noise.sigma / 1e-3).mean() < 1.1 and noise.sigma.max() < 1.5e-3
+
+
+def test_the_noise_of_a_sample_does_not_depend_on_its_batch():
+    """Rounds go on for the sake of others; a sample that has settled stays."""
+    p = drawn()[0][:8]
+    p[1:] += 4e-3 * torch.randn(7, 20, 3, generator=torch.Generator().manual_seed(3))
+    together, _ = estimate_noise(one_contact(), Markers(S, p))
+    alone = [estimate_noise(one_contact(), Markers(S, p[i : i + 1]))[0] for i in range(8)]
+    assert torch.allclose(together.sigma, torch.cat([one.sigma for one in alone]), rtol=1e-6)
+
+
 def test_few_markers_tell_the_noise_by_the_richest_model_they_can(tmp_path, capsys):
     """Three markers cannot determine three loads; one of a sample's markers tells no noise at all, and the table says so."""
     (tmp_path / "robot.toml").write_text(

@@ -66,6 +66,16 @@ def test_the_share_of_the_frame_is_that_of_a_joint_covariance():
     assert torch.allclose(fit.magnitude_std, each.magnitude_std, rtol=0.15)
 
 
+def test_a_count_that_no_shape_asks_for(tmp_path, capsys):
+    """`--contacts auto` of a few shapes: a model that was tried and not chosen has more unknowns than the fits that were kept."""
+    moved = shapes(3)[2]
+    (tmp_path / "robot.toml").write_text(ROD)
+    write_shapes(tmp_path / "shapes.csv", Shapes(moved, ["a", "b", "c"]))
+    command = ["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), "--noise", "1e-3"]
+    assert main([*command, "--registration", "--one-frame", "--contacts", "auto", "--out", str(tmp_path / "r.json")]) == 0
+    assert [len(r["loads"]) for r in json.loads((tmp_path / "r.json").read_text())["results"]] == [1, 1, 1]
+
+
 def test_the_command_line(tmp_path, capsys):
     """One frame for 12 samples, one of them nonsense; with one contact and with auto."""
     study, _, moved = shapes(12)

@@ -14,8 +14,9 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from . import ekf
+from .checks import check
 from .coordinates import GaussianCoordinates
-from .estimator import Settings, check
+from .estimator import Settings
 from .grid import DEFAULT_STEPS
 from .measurement import Markers, Model
 from .result import ACCEPT, Z95

@@ -19,8 +19,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from .checks import usable
 from .coordinates import GaussianCoordinates
-from .estimator import Settings, estimate, usable
+from .estimator import Settings, estimate
 from .geometry import misplaced
 from .measurement import Markers, Model
 from .result import Estimate

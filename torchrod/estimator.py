@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from . import ekf
+from .checks import check, usable
 from .coordinates import PaperCoordinates
 from .fast import Sums, iterate_all
 from .measurement import Markers, Model
@@ -85,14 +86,6 @@ def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[
     mean, precision = model.prior()
     cost = (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
     return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
-
-
-def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
-    """Samples with a marker, as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
-    enough = 3 * markers.present.sum(-1) >= max(model.free_size, 1)
-    if markers.tension is not None:
-        enough = enough & torch.isfinite(markers.tension).all(-1)
-    return enough
 
 
 def _silent(_: int) -> None:
@@ -254,40 +247,26 @@ def estimate(
     start: where to start, or a rule that says so from (model, markers, noise) of some of the samples; a guess that is no nearer to
     the data than a cold start is dropped, and one that leads to no accepted fit is followed by a cold start.
     progress: called as samples finish, with their number. A sample's answer does not depend on its batch.
-    Errors: ValueError for markers that do not fit the robot; a sample that cannot be estimated is reported by its status.
-    Source: the paper, section II; DESIGN.md section 3.
+    Errors: ValueError for markers or a start that do not fit the robot; a sample that cannot be estimated has a status for it.
+    Source: the paper, section II; docs/model.md.
     """
     check(model, markers, noise)
-    if isinstance(start, Start) and len(start.x) != len(markers.positions):
-        raise ValueError(f"start has {len(start.x)} samples and the markers have {len(markers.positions)}; give one for each")
-    parts = []
-    compiled = served(model, markers.positions)
+    if model.robot.gravity.ndim != 1:
+        raise ValueError("an estimate takes one gravity (3,) for all samples; estimate those of each gravity by themselves")
+    parts, compiled = [], served(model, markers.positions)
     size = CHUNK if compiled else CHUNK_TORCH
-    with one_thread(compiled and len(markers.positions) <= FEW):
+    with torch.inference_mode(False), one_thread(compiled and len(markers.positions) <= FEW):
         for first in range(0, len(markers.positions), size):
             index = torch.arange(first, min(first + size, len(markers.positions)))
             chunk = _Chunk(model, markers.take(index), noise, settings or Settings())
-            begin = start.take(index) if isinstance(start, Start) else start(model, chunk.markers, noise)
-            parts.append(_fitted(chunk, begin, progress))
+            parts.append(_fitted(chunk, _begin(start, chunk, index, len(markers.positions)), progress))
     return Estimate.cat(parts)
 
 
-def check(model: Model, markers: Markers, noise: float) -> None:
-    """Raise ValueError, naming the remedy, for measurements that do not fit the robot or the model."""
-    L = model.robot.rod.length
-    tendons = len(model.robot.tendons)
-    if not noise > 0:
-        raise ValueError(f"noise is {noise} m; it must be positive")
-    if len(markers.s) == 0 or len(markers.positions) == 0:
-        raise ValueError("there are no markers; give at least one sample with markers")
-    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + 1e-9)).any()):
-        raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
-    if 3 * len(markers.s) < model.free_size:
-        raise ValueError(
-            f"{len(markers.s)} marker{'s' * (len(markers.s) > 1)} cannot determine {model.free_size} unknowns; "
-            "add markers or drop loads or --registration"
-        )
-    if tendons and markers.tension is None:
-        raise ValueError(f"the robot has {tendons} tendons but the shapes carry no tensions; add tension_1..tension_{tendons}")
-    if markers.tension is not None and markers.tension.shape[-1] != tendons:
-        raise ValueError(f"the shapes carry {markers.tension.shape[-1]} tensions but the robot has {tendons} tendons")
+def _begin(start: StartRule | Start, chunk: _Chunk, index: Int[Tensor, " b"], count: int) -> Start:
+    """Where the samples `index` of `count`, which are the chunk, start."""
+    begin = start if isinstance(start, Start) else start(chunk.model, chunk.markers, chunk.noise)
+    wanted = (count if begin is start else len(index), chunk.model.size)
+    if tuple(begin.x.shape) != wanted:
+        raise ValueError(f"start.x has shape {tuple(begin.x.shape)}; these markers and this model need {wanted}")
+    return begin.take(index) if begin is start else begin

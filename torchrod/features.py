@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from .equilibrium import without_load
+from .kept import version
 from .measurement import Markers, Model
 from .robot import Robot
 from .rod import DTYPE
@@ -115,7 +116,7 @@ def smoothed(
     """(2) from displacements over L; s, length and noise in m. Each pattern of markers seen is solved once."""
     y = torch.where(seen.unsqueeze(-1), y, 0.0)
     if bool(seen.all()):
-        rows = y.mT.flatten(0, 1) @ _kriging_of_all(s, s._version, length, noise / length)[0].mT  # one product for all samples
+        rows = y.mT.flatten(0, 1) @ _kriging_of_all(s, version(s), length, noise / length)[0].mT  # one product for all samples
         out = rows.unflatten(0, (-1, 3)).mT
     else:
         patterns, which = torch.unique(seen, dim=0, return_inverse=True)
@@ -145,7 +146,7 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
     """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod."""
     L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
     stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
-    places = _places(markers.s, markers.s._version, L)
+    places = _places(markers.s, version(markers.s), L)
     rest = without_load(model, replace(markers, s=places, offsets=None))
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
     p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)

@@ -101,6 +101,8 @@ def _first(parts: Parts, fit: Estimate, used: Bool[Tensor, " B"]) -> BaseFrame:
     assert fit.registration is not None
     for model, index in parts:
         some, first = index[used[index]], model.load_size + model.tension_size
+        if not len(some):  # of a model that no sample chose the kept fits may hold fewer entries than it has
+            continue
         scale = model.zeta_scale(fit.x)
         C = fit.covariance[some, first : first + 6, first : first + 6] * scale * scale.unsqueeze(-1)
         known = torch.linalg.inv(C) - P

@@ -6,7 +6,7 @@ s: Wn(s) = int_s^L f, Wm(s). A narrow Gaussian, or a point force, is therefore c
 
 Shapes: s and `inside` are (..., S, 3), the three stages of S steps; parameters are (..., K) or (..., K, .); integrals are
 (..., S, 3, 3). `inside` is a point strictly inside the step that s belongs to: it decides on which side of a jump s lies.
-SI units. Source: the paper's (9)-(13); DESIGN.md section 2.
+SI units. Source: the paper's (9)-(13); docs/model.md.
 """
 
 import math

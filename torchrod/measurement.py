@@ -22,6 +22,7 @@ from .lie import move, rotate, unrotate
 from .loads import LoadIntegrals, total
 from .march import march_linearized
 from .robot import Robot
+from .rod import DTYPE
 from .statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table
 from .step import Section
 
@@ -41,7 +42,8 @@ class Markers:
 
     s: (P,) m, arc lengths. positions: (B, P, 3) m, base frame, NaN where a marker is missing. offsets: (P, 3) m, from the centre
     line in the section frame, so that the marker sits at p(s) + R(s) r. tension: (B, T) N for a tendon robot. sigma: (B,) m, each
-    sample's own noise, which then goes before the one that an estimate is given (torchrod.estimate_noise).
+    sample's own noise, which then goes before the one that an estimate is given (torchrod.estimate_noise). Numbers of another
+    precision are made float64.
     """
 
     s: Float[Tensor, " P"]
@@ -49,6 +51,24 @@ class Markers:
     offsets: Float[Tensor, "P 3"] | None = None
     tension: Float[Tensor, "B T"] | None = None
     sigma: Float[Tensor, " B"] | None = None
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if value is not None and value.dtype != DTYPE:
+                object.__setattr__(self, name, value.to(DTYPE))
+
+    @property
+    def misshapen(self) -> str | None:
+        """What does not belong together, in one sentence; None where all does."""
+        P, B = self.s.numel(), len(self.positions)
+        shapes = {"s": (P,), "positions": (B, P, 3), "offsets": (P, 3), "tension": (B, None), "sigma": (B,)}
+        for name, value in vars(self).items():
+            wanted, found = shapes[name], () if value is None else tuple(value.shape)
+            fits = len(found) == len(wanted) and all(w in (None, n) for w, n in zip(wanted, found, strict=True))
+            if value is not None and not fits:
+                shown = str(wanted).replace("None", "tendons")
+                return f"markers.{name} has shape {found}; with {P} arc lengths and {B} samples it must have {shown}"
+        return None
 
     @property
     def present(self) -> Bool[Tensor, "B P"]:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from . import fast
 from .errors import InputError
+from .kept import version
 
 SCHEMA = 1  # of the card
 PER_LOAD = 4
@@ -98,7 +99,7 @@ class Network(torch.nn.Module):
         """The last hidden layer: by the compiled kernel where it serves and no derivative is wanted."""
         plain = x.dtype == self.mean.dtype == torch.float64 and x.device.type == "cpu"
         if plain and not self.head.weight.requires_grad and not x.requires_grad and fast.available():
-            return self._compiled(tuple(p._version for p in self.body.parameters()))(self._scaled(x))
+            return self._compiled(tuple(version(p) for p in self.body.parameters()))(self._scaled(x))
         return self.body(self._scaled(x))
 
     def _scaled(self, x: Float[Tensor, "B i"]) -> Float[Tensor, "B i"]:

@@ -67,10 +67,15 @@ def white(fit: Estimate) -> Bool[Tensor, " B"]:
     return rho < SMOOTH / (3 * pairs.clamp(min=1)).sqrt()
 
 
+def _spent(model: Model) -> int:
+    """What the unknowns take of the marker coordinates that a fit uses: 3 of those are nu + this."""
+    return model.free_size - model.coordinates.informative_priors
+
+
 def _sigma(model: Model, fit: Estimate) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """(1), over the markers that are not outliers."""
     used = torch.isfinite(fit.residual[..., 0]) & ~fit.outlier
-    nu = 3.0 * used.sum(-1) - model.free_size + model.coordinates.informative_priors
+    nu = 3.0 * used.sum(-1) - _spent(model)
     square = torch.where(used, fit.residual.square().sum(-1), 0.0).sum(-1)
     return torch.where(nu > 0, (square / nu).sqrt().clamp(min=LEAST * model.robot.rod.length), torch.nan), nu
 
@@ -85,15 +90,17 @@ def estimate_noise(
     L, settings = model.robot.rod.length, replace(settings or Settings(), restarts=())
     sigma = torch.full((len(markers.positions),), FIRST * L, dtype=torch.float64)
     begin: StartRule | Start = start
-    nu = torch.zeros_like(sigma)
+    nu, settled = torch.zeros_like(sigma), torch.zeros_like(sigma, dtype=torch.bool)
     for _ in range(ROUNDS):
         known = replace(markers, sigma=sigma)
         fit = estimate(model, known, FIRST * L, settings, begin)
-        found, nu = _sigma(model, fit)
-        moved = float((found / sigma).log().abs().nan_to_num(0.0).max())
-        # Not down to nothing in one round: the fit must follow.
-        sigma = torch.maximum(found.where(torch.isfinite(found), sigma), 0.02 * sigma)
-        if moved < SETTLED:
+        found, freedom = _sigma(model, fit)
+        moved = (found / sigma).log().abs().nan_to_num(0.0)
+        # Not down to nothing in one round: the fit must follow. A sample that has settled stays, whatever its neighbours do.
+        onward = torch.maximum(found.where(torch.isfinite(found), sigma), 0.02 * sigma)
+        sigma, nu = torch.where(settled, sigma, onward), torch.where(settled, nu, freedom)
+        settled = settled | (moved < SETTLED)
+        if bool(settled.all()):
             break
         begin = Start(fit.x, None, torch.isfinite(fit.x).all(-1))
     known = nu > 0
@@ -110,15 +117,19 @@ def estimate_noise_among(
     The richest that a sample has markers for tells its noise. It contains the others, so that its residual is the least of all;
     where a poorer one leaves less, the fit of the richest has not settled, and the poorer one tells it. Without that a tenth of the
     samples without a load, and 3 % of those with one, get a noise up to 14 times too large when it is 0.2 mm. A model without a
-    load never stands in for one that has too few markers: it would take a load for noise.
+    load never stands in for one that has too few markers: it would take a load for noise. Nor does one that leaves more markers
+    aside as outliers: a robust fit with too few loads calls most of them so.
     """
     fitting = [model for model in models if 3 * len(markers.s) >= model.free_size] or [models[0]]
     noise, known = estimate_noise(fitting[-1], markers, settings, start)
+    used = noise.freedom + _spent(fitting[-1])
     for model in reversed(fitting[:-1]):
         other, by_other = estimate_noise(model, markers, settings, start)
-        less = other.sigma.square() * other.freedom < noise.sigma.square() * noise.freedom
+        by_more = other.freedom + _spent(model)
+        less = (other.sigma.square() * other.freedom < noise.sigma.square() * noise.freedom) & (by_more >= used)
         instead = torch.isnan(noise.sigma) & torch.isfinite(other.sigma) & (model.load_size > 0)
         swap = less | instead
+        used = torch.where(swap, by_more, used)
         noise = Noise(*(torch.where(swap, theirs, mine) for mine, theirs in zip(astuple(noise), astuple(other), strict=True)))
         assert known.sigma is not None
         assert by_other.sigma is not None

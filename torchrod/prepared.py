@@ -18,6 +18,7 @@ from . import ekf, fast
 from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
 from .grid import Grid
 from .jacobian import forward_jacobian
+from .kept import version
 from .loads import total
 from .measurement import TURN_SCALE, Markers, Model
 from .statics import beyond_tip, grid_for, stage_table
@@ -162,7 +163,7 @@ def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, 
     robot = model.robot
     if x is None:
         held = (markers.s, markers.offsets, robot.gravity, *(v for v in vars(robot.rod).values() if isinstance(v, Tensor)))
-        versions = tuple(v._version for v in held if v is not None)
+        versions = tuple(version(v) for v in held if v is not None)
         layout = _kept_layout(model, markers.s, markers.offsets, versions)
     else:
         layout = _layout(model, markers.s, markers.offsets, x)

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .estimator import Settings, check, estimate, usable
+from .checks import check, usable
+from .estimator import Settings, estimate
 from .fit import Evidence
 from .measurement import Markers, Model
 from .probe import probe, start_with_one_more

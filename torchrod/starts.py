@@ -10,6 +10,7 @@ from torch import Tensor
 from .equilibrium import at_rest, without_load
 from .measurement import Markers, Model
 from .prepared import Prepared
+from .rod import DTYPE
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Start:
 
     Sigma0: the covariance (B, n, n) to start with; None leaves it to the settings. warm: (B,), which samples start from a guess;
     the others start cold, from no load. cold: x of a cold start, and costs (B, 2) of x and of that by the model, if the rule has
-    them at hand.
+    them at hand. Numbers of another precision are made float64.
     """
 
     x: Float[Tensor, "B n"]
@@ -26,6 +27,12 @@ class Start:
     warm: Bool[Tensor, " B"]
     cold: Float[Tensor, "B n"] | None = None
     costs: Float[Tensor, "B 2"] | None = None
+
+    def __post_init__(self):
+        for name in ("x", "Sigma0", "cold", "costs"):
+            value = getattr(self, name)
+            if value is not None and value.dtype != DTYPE:
+                object.__setattr__(self, name, value.to(DTYPE))
 
     @classmethod
     def known(cls, x: Float[Tensor, "B n"]) -> "Start":

@@ -233,7 +233,7 @@ def solve_shape(
     Newton on three numbers with them, until the base misses it by less than the tolerance (rad). Loads (B, ...) in their own frames
     and units (torchrod.loads), tension N, outputs m. q_tip: where to look for the tip's orientation, with all of the load at once.
     Errors: none raised for numbers; a sample that cannot be solved has status NOT_CONVERGED, one that holds NaN INVALID.
-    Source: DESIGN.md section 2.
+    Source: docs/model.md.
     """
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)

@@ -14,7 +14,7 @@ G, G2, Gm, Wn, Wm are the closed-form integrals of torchrod.loads. Then, with v,
     (4)  M' = -u x M - v x N - l - R^T l_w   and (1)  give   M~' = -u x (M - R^T Wm) - v x N - e3 x G
 
 In (3) and (4) no load density is left, so a narrow Gaussian costs no accuracy, and without world-frame loads they do not see
-the orientation. Source: DESIGN.md section 2, which rewrites Rucker & Webster 2011 for the whole section.
+the orientation. Source: docs/model.md, which rewrites Rucker & Webster 2011 for the whole section.
 Everything here is pointwise in the leading dimensions and free of branches on values: it can be mapped, differentiated in
 forward mode, compiled whole, or traced into a kernel.
 """

@@ -7,6 +7,7 @@ from torch import Tensor
 from .estimator import Settings, estimate
 from .measurement import Markers, Model
 from .result import Estimate
+from .rod import DTYPE
 from .starts import Start, StartRule, cold_start
 from .warmstart import find_warm_start
 
@@ -31,7 +32,8 @@ class Estimator:
         offsets: Float[Tensor, "P 3"] | None = None,
         settings: Settings | None = None,
     ):
-        self.model, self.s, self.noise, self.offsets = model, s, noise, offsets
+        self.model, self.noise = model, noise
+        self.s, self.offsets = s.to(DTYPE), None if offsets is None else offsets.to(DTYPE)  # once, not frame by frame
         self.settings = settings or Settings()
         self._first: StartRule = find_warm_start(model) or cold_start
         self._last: Float[Tensor, "1 n"] | None = None

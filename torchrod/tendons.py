@@ -108,7 +108,7 @@ def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "..
 
         t_j = (v + u x r_j + r_j') / |.|
 
-    so that the tendons' wrench on their side of the section is sum_j tau_j g_j. Source: DESIGN.md section 2; Rucker & Webster 2011.
+    so that the tendons' wrench on their side of the section is sum_j tau_j g_j. Source: docs/model.md; Rucker & Webster 2011.
     """
     along = (table.L * x[..., None, None, :]).sum(-1) + table.dr
     stretch = (along * along).sum(-1, keepdim=True).sqrt()
@@ -148,7 +148,7 @@ def balanced_strains(
         N = K_se (v - v*) + sum_j tau_j t_j(v, u),    M = K_bt (u - u*) + sum_j tau_j r_j x t_j(v, u)
 
     Newton on the convex energy from the unstrained section. Only the last step is differentiated, with its matrix held fixed:
-    exact, because dx = -J^-1 dF at the solution, and cheap. Source: DESIGN.md section 2.
+    exact, because dx = -J^-1 dF at the solution, and cheap. Source: docs/model.md.
     """
     x_star = torch.cat([v_star.expand_as(u_star), u_star], -1)
 

@@ -186,6 +186,7 @@ def _round_and_straight(rod: Rod) -> bool:
 
 
 @lru_cache(maxsize=1)
+@torch.inference_mode(False)  # they outlive the first call
 def shipped() -> tuple[WarmStart, ...]:
     """The checkpoints that come with torchrod, beside the package or within it. They start cold what they do not know."""
     folder = next((f for f in FOLDERS if any(f.glob("*.safetensors"))), None)

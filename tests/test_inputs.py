@@ -1,0 +1,89 @@
+"""What the Python interface does with tensors that are not quite what it wants."""
+
+import pytest
+import torch
+
+from tests.robots import steel_rod
+from tests.study import study1
+from torchrod import (
+    Estimator,
+    GaussianCoordinates,
+    Markers,
+    Model,
+    Robot,
+    Start,
+    WarmStart,
+    cold_start,
+    estimate,
+    find_warm_start,
+)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    torch.set_default_dtype(torch.float64)
+    study = study1(4)
+    return study.s, study.positions
+
+
+def one_contact(robot: Robot | None = None) -> Model:
+    robot = robot or steel_rod()
+    return Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale))
+
+
+def test_numbers_of_single_precision(seen):
+    """As a camera gives them: markers, offsets, a start and its covariance."""
+    s, p = seen
+    model, markers = one_contact(), Markers(s, p, torch.zeros(20, 3))
+    whole = estimate(model, markers, 1e-3)
+    single = Markers(*(x.float() for x in (s, p, torch.zeros(20, 3))))
+    assert all(x is not None and x.dtype == torch.float64 for x in (single.s, single.positions, single.offsets))
+    cold = cold_start(model, single, 1e-3)
+    start = Start(cold.x.float(), torch.eye(model.size).float().repeat(4, 1, 1), cold.warm)
+    for fit in (estimate(model, single, 1e-3), estimate(model, single, 1e-3, start=start)):
+        assert torch.allclose(fit.force, whole.force, atol=1e-4) and fit.accepted.all()
+    follow = Estimator(model, s.float(), 1e-3)
+    assert torch.allclose(follow(p[0].float()).force[0], whole.force[0], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            {"positions": torch.zeros(4, 15, 3)},
+            r"markers.positions has shape \(4, 15, 3\); with 20 arc lengths and 4 samples .* \(4, 20, 3\)",
+        ),
+        ({"offsets": torch.zeros(5, 3)}, r"markers.offsets has shape \(5, 3\)"),
+        ({"tension": torch.zeros(3, 2)}, r"markers.tension has shape \(3, 2\).*\(4, tendons\)"),
+        ({"sigma": torch.ones(1)}, r"markers.sigma has shape \(1,\)"),
+        ({"s": torch.zeros(1, 20)}, r"markers.s has shape"),
+    ],
+)
+def test_shapes_that_do_not_belong_together(seen, changed, said):
+    with pytest.raises(ValueError, match=said):
+        estimate(one_contact(), Markers(**({"s": seen[0], "positions": seen[1]} | changed)), 1e-3)
+
+
+def test_starts_and_gravity_that_do_not_fit(seen):
+    model, markers = one_contact(), Markers(*seen)
+    with pytest.raises(ValueError, match=r"start.x has shape \(4, 3\); these markers and this model need \(4, 10\)"):
+        estimate(model, markers, 1e-3, start=lambda *_: Start.known(torch.zeros(4, 3)))
+    tilted = one_contact(Robot(steel_rod().rod, gravity=torch.zeros(4, 3)))
+    with pytest.raises(ValueError, match="one gravity"):
+        estimate(tilted, markers, 1e-3)
+
+
+def test_inference_mode(seen):
+    """Tensors made in it do not tell whether they have been changed; what is kept must serve outside of it, too."""
+    s, p = seen
+    whole = estimate(one_contact(), Markers(s, p), 1e-3)
+    with torch.inference_mode():
+        model, markers = one_contact(), Markers(s.clone(), p.clone())
+        start = find_warm_start(model)
+        assert isinstance(start, WarmStart)
+        within = [estimate(model, markers, 1e-3), estimate(model, markers, 1e-3, start=start)]
+        follow = Estimator(model, s.clone(), 1e-3)
+        within += [follow(p[0].clone()), follow(p[0].clone())]
+    within += [estimate(model, markers, 1e-3, start=start), follow(p[0])]
+    for fit in within:
+        assert torch.allclose(fit.force, whole.force[: len(fit.force)], atol=1e-4)
