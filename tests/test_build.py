@@ -147,3 +147,19 @@ def test_threads_that_ask_at_once_begin_one_build_under_a_name_of_its_own(tmp_pa
     names = [Path(line).name for line in (tmp_path / "builds").read_text().splitlines()]
     assert len(names) == 2
     assert all(len(name.split(".")[1]) == 32 for name in names), names
+
+
+@needs_compiler
+def test_libraries_that_nobody_has_loaded_for_long_go(tmp_path):
+    cxx, cache, long_ago = copying(tmp_path), tmp_path / "cache", time.time() - 100 * 24 * 3600
+    run(LOADED, cxx, cache)
+    (first,) = cache.iterdir()
+    for path in (first, cache / "kernel-old.so", cache / "notes"):
+        path.touch()
+        os.utime(path, (long_ago, long_ago))
+    run(LOADED, cxx, cache)
+    (cache / "kernel-new.so").touch()
+    run(LOADED, f"env {cxx}", cache)
+    names = {path.name for path in cache.iterdir()}
+    assert len(names) == 4
+    assert {first.name, "kernel-new.so", "notes"} < names

@@ -5,6 +5,7 @@ and happens once per machine: it goes on by itself while the torch path serves, 
 library. TORCHROD_FAST=0 switches it off; TORCHROD_CACHE names another folder for it (default ~/.cache/torchrod).
 """
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -28,12 +29,19 @@ PATIENCE = 2.0  # s that a first estimate waits for a build
 GIVE_UP = 300.0  # s after which a build is held to be dead
 
 # Renamed when whole: another process sees the whole library or none. What the compiler has printed goes when it has succeeded, and
-# last, so that the build is over once it is gone; it stays, under a name known to all, when it has failed.
+# last, so that the build is over once it is gone; it stays, under a name known to all, when it has failed. What nobody has loaded
+# for so many days (`_load` keeps the time), of other sources, compilers and processors, goes with a success.
 SCRIPT = """
 PATH=$PATH:/usr/bin:/bin
 part=$1 target=$2 messages=$3 log=$4
 shift 4
-if "$@" -o "$part" && mv -f "$part" "$target"; then rm -f "$log" "$messages"; else rm -f "$part"; mv -f "$messages" "$log"; fi
+if "$@" -o "$part" && mv -f "$part" "$target"; then
+    find "${target%/*}" -maxdepth 1 -type f -name "kernel-*" ! -path "$target" -mtime +90 -exec rm -f {} +
+    rm -f "$log" "$messages"
+else
+    rm -f "$part"
+    mv -f "$messages" "$log"
+fi
 """
 _starting = threading.Lock()
 
@@ -155,9 +163,12 @@ def _say_once(reason: str) -> None:
 def _load(path: Path) -> ctypes.CDLL | str:
     """The library, or why it cannot be loaded."""
     try:
-        return ctypes.CDLL(str(path))
+        loaded = ctypes.CDLL(str(path))
     except OSError as error:
         return str(error)
+    with contextlib.suppress(OSError):  # a cache that may only be read
+        os.utime(path)
+    return loaded
 
 
 @functools.lru_cache(maxsize=1)
