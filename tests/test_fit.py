@@ -131,6 +131,27 @@ def test_one_iteration_of_the_filter():
     assert torch.isnan(sums.A[1]).all()
 
 
+def test_another_type_of_number_is_refused_before_the_kernel_writes_beyond_it():
+    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
+    prepared = Prepared(model, markers, model.weights(markers, 1e-3))
+    tables, index = prepared.tables(x), torch.arange(B)
+    with pytest.raises(TypeError, match=r"x is torch.float32.*torch.float64"):
+        fast.measure_now(x.float(), index, True, tables.structure, tables.markers)
+    with pytest.raises(TypeError, match=r"index is torch.int32.*torch.int64"):
+        fast.measure_now(x, index.int(), True, tables.structure, tables.markers)
+    for call in (prepared.cost, prepared.sums, prepared.h):
+        with pytest.raises(TypeError, match=r"x is torch.float32"):
+            call(x.float())
+    with pytest.raises(TypeError, match=r"positions is torch.float32"):
+        tables.with_rows(markers.positions.float(), prepared.w, 4.0)
+    sums = fast.Sums.room(B, model.size, 3)
+    Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
+    state = {"Sigma": Sigma0.clone(), "before": x.clone(), "cap": torch.ones(B), "done": torch.zeros(B, dtype=torch.bool)}
+    for wrong in ({"x": x.float()}, {"x": x.clone(), "done": torch.zeros(B)}):
+        with pytest.raises(TypeError, match=f"{list(wrong)[-1]} is torch"):
+            prepared.iteration(ekf.Iterate(**(state | wrong)), Sigma0, Q, ekf.Limits(), sums)
+
+
 def test_gradients_and_transforms_go_through_the_operator():
     model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), True, "none")
     tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from .fitting import FitTables, Sums, run
-from .structures import Course, Filter, fill
+from .structures import Course, Filter, address, fill
 from .structures import Sums as CSums
 
 
@@ -28,7 +28,7 @@ class Iteration:
         """One iteration of the samples `live`."""
         b, live = len(live), live.contiguous()
         pointers = [ctypes.byref(x) for x in (tables.structure, self.filter, self.sums)]
-        run("torchrod_iterate", b, *pointers, ctypes.c_void_p(live.data_ptr()), ctypes.c_int64(b))
+        run("torchrod_iterate", b, *pointers, address(live, "live"), ctypes.c_int64(b))
 
 
 def iterate_all(
@@ -48,5 +48,5 @@ def iterate_all(
     parts = {"coarse": rough[1].structure, "fine": fine[1].structure, "rough": rough[0].filter, "filter": fine[0].filter}
     for name, structure in (parts | {"out": fine[0].sums}).items():
         setattr(course, name, ctypes.addressof(structure))
-    run("torchrod_filter", len(live), ctypes.byref(course), ctypes.c_void_p(live.data_ptr()), ctypes.c_int64(len(live)))
+    run("torchrod_filter", len(live), ctypes.byref(course), address(live, "live"), ctypes.c_int64(len(live)))
     return converged, iterations

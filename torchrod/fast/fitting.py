@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .build import library
-from .structures import Fit, fill, pointer, threads
+from .structures import Fit, address, fill, pointer, threads
 from .structures import Sums as CSums
 
 FAMILIES = {"none": 0, "gaussian": 1, "paper": 2, "point": 3, "linear": 4}
@@ -67,7 +67,7 @@ class FitTables:
         rows = [positions.contiguous(), w.contiguous()]
         other = FitTables([*self.tensors[:-2], *rows], self.counts, [*self.numbers[:-1], nu])
         copy = Fit.from_buffer_copy(self.structure)
-        copy.positions, copy.w, copy.robust = pointer(rows[0]), pointer(rows[1]), nu
+        copy.positions, copy.w, copy.robust = pointer(rows[0], "positions"), pointer(rows[1], "w"), nu
         vars(other)["structure"] = copy
         return other
 
@@ -90,10 +90,6 @@ def run(function: str, samples: int, *arguments: object) -> None:
     _spent[0] += time.perf_counter() - begun
 
 
-def _at(x: Tensor) -> ctypes.c_void_p:
-    return ctypes.c_void_p(x.data_ptr())
-
-
 def _outputs(counts: list[int]) -> int:
     """P."""
     return counts[COUNTS.index("outputs")] - 1
@@ -105,8 +101,8 @@ def measure_now(x: Tensor, index: Tensor, slopes: bool, fit: Fit, P: int) -> tup
     h, line = x.new_empty(b, 3 * P + 6), x.new_empty(b, P, 3)
     H = x.new_empty(b, 3 * P + 6, n if slopes else 0)
     x, index = x.contiguous(), index.contiguous()
-    address = _at(H) if slopes else ctypes.c_void_p(None)
-    run("torchrod_measure", b, ctypes.byref(fit), _at(x), _at(index), ctypes.c_int64(b), _at(h), address, _at(line))
+    given, out = (address(x, "x"), address(index, "index")), (address(h, "h"), address(H if slopes else None, "H"))
+    run("torchrod_measure", b, ctypes.byref(fit), *given, ctypes.c_int64(b), *out, address(line, "line"))
     return h, H, line
 
 
@@ -177,8 +173,9 @@ def normal_equations_now(x: Tensor, fit: Fit, P: int) -> tuple[Tensor, Tensor, T
     A, g, cost = x.new_empty(B, 2, n, n), x.new_empty(B, 2, n), x.new_empty(B, 2)
     r, line = x.new_empty(B, 3 * P + 6), x.new_empty(B, P, 3)
     sums, x = CSums(), x.contiguous()
+    given = address(x, "x")
     fill(sums, {"A": A, "g": g, "cost": cost, "r": r, "line": line}, {})
-    run("torchrod_normal", B, ctypes.byref(fit), _at(x), ctypes.c_int64(B), ctypes.byref(sums))
+    run("torchrod_normal", B, ctypes.byref(fit), given, ctypes.c_int64(B), ctypes.byref(sums))
     return A, g, cost, r, line
 
 
@@ -199,7 +196,8 @@ def _(x, tensors, counts, numbers):
 def cost_now(x: Float[Tensor, "B n"], mean: Float[Tensor, " n"], precision: Float[Tensor, " n"], fit: Fit) -> Float[Tensor, " B"]:
     """The cost at x, the prior's (mean and precision) included."""
     x, mean, precision, cost = x.contiguous(), mean.contiguous(), precision.contiguous(), x.new_empty(len(x))
-    run("torchrod_cost", len(x), ctypes.byref(fit), _at(x), _at(mean), _at(precision), ctypes.c_int64(len(x)), _at(cost))
+    given = (address(x, "x"), address(mean, "mean"), address(precision, "precision"))
+    run("torchrod_cost", len(x), ctypes.byref(fit), *given, ctypes.c_int64(len(x)), address(cost, "cost"))
     return cost
 
 
@@ -213,8 +211,9 @@ def balance_now(
     B, x = len(x), x.contiguous()
     q_tip = None if q_tip is None else q_tip.contiguous()
     wrench, missed, line = x.new_empty(B, 6), x.new_empty(B), x.new_empty(B, P + 1, 3)
-    start, numbers = ctypes.c_void_p(pointer(q_tip)), (ctypes.c_int64(increments), ctypes.c_int64(B), ctypes.c_double(tolerance))
-    run("torchrod_balance", B, ctypes.byref(fit), _at(x), start, *numbers, _at(wrench), _at(missed), _at(line))
+    start, numbers = address(q_tip, "q_tip"), (ctypes.c_int64(increments), ctypes.c_int64(B), ctypes.c_double(tolerance))
+    out = (address(wrench, "wrench"), address(missed, "missed"), address(line, "line"))
+    run("torchrod_balance", B, ctypes.byref(fit), address(x, "x"), start, *numbers, *out)
     return wrench, missed, line[:, :P]
 
 

@@ -3,6 +3,7 @@
 import ctypes
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from ..threads import kernel_threads
@@ -102,12 +103,32 @@ SHARED_DIMENSIONS = {
 }
 
 
-def pointer(x: Tensor | None) -> int | None:
-    """The address of a contiguous tensor's first number; null for none."""
+# What the kernel reads and writes at an address: double, but for these.
+_DOUBLE, _INT64, _FLAGS = (torch.float64,), (torch.int64,), (torch.bool, torch.uint8)
+_TYPES = {
+    **dict.fromkeys(("at", "node", "sizes", "iterations", "index", "live"), _INT64),
+    **dict.fromkeys(("done", "near", "converged"), _FLAGS),
+    "weights": (torch.float32,),
+}
+
+
+def pointer(x: Tensor | None, name: str) -> int | None:
+    """The address of a contiguous tensor's first number, of the type that the kernel takes `name` for; null for none.
+
+    Errors: TypeError for another type, which the kernel would read and write beyond its end.
+    """
     if x is None:
         return None
+    wanted = _TYPES.get(name, _DOUBLE)
+    if x.dtype not in wanted:
+        raise TypeError(f"{name} is {x.dtype}, but the compiled kernel takes {wanted[0]}; convert it with .to({wanted[0]})")
     assert x.is_contiguous(), "the kernel reads contiguous memory"
     return x.data_ptr()
+
+
+def address(x: Tensor | None, name: str) -> ctypes.c_void_p:
+    """The same as an argument of a function."""
+    return ctypes.c_void_p(pointer(x, name))
 
 
 def fill(structure: ctypes.Structure, tensors: Mapping[str, Tensor | None], numbers: Mapping[str, float | int]) -> None:
@@ -116,9 +137,9 @@ def fill(structure: ctypes.Structure, tensors: Mapping[str, Tensor | None], numb
         if kind is Table:
             x = tensors.get(name)
             rows = x is not None and x.ndim > SHARED_DIMENSIONS[name]
-            setattr(structure, name, Table(pointer(x), x[0].numel() if x is not None and rows else 0))
+            setattr(structure, name, Table(pointer(x, name), x[0].numel() if x is not None and rows else 0))
         elif kind is _P:
-            setattr(structure, name, pointer(tensors.get(name)))
+            setattr(structure, name, pointer(tensors.get(name), name))
         elif isinstance(kind, type) and issubclass(kind, ctypes.Structure):
             fill(getattr(structure, name), tensors, numbers)
         else:
