@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from torch import Tensor
 
+from .files import put
 from .observability import LOCALIZED, Observability
 from .plot import INK, LOAD, MARKER
 
@@ -61,6 +62,7 @@ def draw_observability(path: str | Path, layouts: list[Layout], length: float, t
     """Write the figure: the first layout solid, one that it is compared with dashed.
 
     length: L (m). nearest: the layout was proposed for pushes from there on (m); what is nearer the base is shaded.
+    Errors: InputError where the file cannot be written.
     """
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
@@ -82,4 +84,4 @@ def draw_observability(path: str | Path, layouts: list[Layout], length: float, t
     _finish(left, layouts, length, "Smallest push that is ...", "force (N), worst direction")
     _finish(right, layouts, length, f"How well a push of {force:.3g} N is located", "standard deviation of the location (mm)")
     figure.suptitle(textwrap.fill(title, 120), fontsize=12)
-    figure.savefig(path, dpi=150)
+    put(path, lambda file: figure.savefig(file, format=Path(path).suffix[1:] or None, dpi=150))

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..diagnosis import Diagnosis
 from ..errors import InputError
+from ..files import put, put_text
 from ..fit import Evidence, Fit
 from ..noise import Noise
 from ..profile import Profile
@@ -124,10 +125,11 @@ def write_result(
     diagnosis: Diagnosis | None = None,
     noise: Noise | None = None,
 ) -> None:
-    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix.
+    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
+    Errors: InputError for another suffix, and where the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
@@ -144,7 +146,7 @@ def write_result(
         texts = [json.dumps(record, indent=1) for record in records]
         if profile is not None:
             texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
-        path.write_text(f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n", encoding="utf-8")
+        put_text(path, f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n")
         return
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
@@ -155,9 +157,8 @@ def write_result(
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
         arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
-    np.savez_compressed(
-        path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}
-    )
+    named = {"sample": np.array(samples), "robot": np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}}
+    put(path, lambda file: np.savez_compressed(file, **named))  # pyright: ignore[reportArgumentType]
 
 
 def _index(path: Path, names: list[str], sample: str) -> int:

@@ -100,8 +100,11 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
 
 def read_robot(path: str | Path) -> Robot:
     """A robot from ROBOT.toml (docs/files.md). SI units. Errors: InputError naming file, key and remedy."""
-    path = Path(path)
-    content = read_toml(path)
+    return robot_of(Path(path), read_toml(Path(path)))
+
+
+def robot_of(path: Path, content: dict[str, Any]) -> Robot:
+    """The same from what a ROBOT.toml says; path: what refusals call it."""
     if "rod" not in content:
         raise InputError(f"{path}: has no [rod] table; give at least length, diameter, youngs_modulus and shear_modulus")
     as_table(str(path), content, TOP_KEYS)

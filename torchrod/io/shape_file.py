@@ -1,6 +1,7 @@
 """SHAPES: measured marker positions, CSV or NPZ. Every refusal is one sentence with file, place and remedy."""
 
 import csv
+import io
 import math
 import zipfile
 import zlib
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError
+from ..files import put_text
 from ..geometry import too_far, too_short
 from ..measurement import Markers
 from ..robot import Robot
@@ -179,15 +181,16 @@ def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, f
 
 
 def write_shapes(path: str | Path, shapes: Shapes) -> None:
-    """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells."""
+    """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells. Errors: InputError."""
     markers = shapes.markers
     tensions = [] if markers.tension is None else [f"tension_{i + 1}" for i in range(markers.tension.shape[-1])]
     header = ["sample", *REQUIRED, *([] if markers.offsets is None else OFFSETS), *tensions]
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for b, name in enumerate(shapes.samples):
-            for i, s in enumerate(markers.s.tolist()):
-                position = ["" if math.isnan(v) else v for v in markers.positions[b, i].tolist()]
-                offset = [] if markers.offsets is None else markers.offsets[i].tolist()
-                writer.writerow([name, s, *position, *offset, *([] if markers.tension is None else markers.tension[b].tolist())])
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(header)
+    for b, name in enumerate(shapes.samples):
+        for i, s in enumerate(markers.s.tolist()):
+            position = ["" if math.isnan(v) else v for v in markers.positions[b, i].tolist()]
+            offset = [] if markers.offsets is None else markers.offsets[i].tolist()
+            writer.writerow([name, s, *position, *offset, *([] if markers.tension is None else markers.tension[b].tolist())])
+    put_text(path, text.getvalue())
