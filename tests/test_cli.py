@@ -101,7 +101,7 @@ def npz(path: Path, **arrays) -> None:
 BAD = {
     "missing robot": (None, STRAIGHT, [], "robot.toml: cannot be read"),
     "missing shapes": (ROD, None, [], "shapes.csv: no such file"),
-    "not toml": ("length = = 3", STRAIGHT, [], "not valid TOML"),
+    "not toml": ("length = = 3", STRAIGHT, [], "(Invalid value (at line 1, column 10)); correct that place"),
     "no rod": ("name = 'x'", STRAIGHT, [], "has no [rod] table"),
     "unknown key": (ROD.replace("diameter", "diametre"), STRAIGHT, [], "unknown key 'diametre'"),
     "missing key": (ROD.replace("diameter", "#"), STRAIGHT, [], "rod.diameter is missing"),

@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from tests.robots import T
-from torchrod import Markers, Shapes, files, write_shapes
+from torchrod import Markers, Shapes, WarmStart, files, read_robot, read_shapes, write_shapes
 from torchrod.arguments import writable
 from torchrod.cli import main
 from torchrod.errors import InputError
 from torchrod.files import put, put_text
+from torchrod.io import read_fit
 
 ROOT = Path(__file__).resolve().parents[1]
 SHAPES = Shapes(Markers(T([0.1, 0.2]), torch.zeros(1, 2, 3)), ["0"])
@@ -109,3 +110,28 @@ def test_refusals_name_path_and_remedy(tmp_path, monkeypatch):
         (tmp_path / "loop").symlink_to("loop")
         with pytest.raises(InputError):
             writable(str(tmp_path / name), (".csv",))
+
+
+def test_what_cannot_be_read_is_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "ok.csv").write_bytes((ROOT / "docs" / "example" / "rod.csv").read_bytes())
+    for name in ("a.csv", "a.npz", "a.json", "a.safetensors", "a.toml"):
+        (tmp_path / name).write_text("{}")
+    opened, robot = Path.open, read_robot(ROOT / "docs" / "example" / "rod.toml")
+
+    def denied(path, *arguments, **options):  # root is denied nothing
+        if path.stem == "a":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        return opened(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", denied)
+    for read, suffixes in (
+        (lambda path: read_shapes(path, robot), (".csv", ".npz")),
+        (lambda path: read_fit(path, "0"), (".npz", ".json")),
+        (WarmStart.read, (".safetensors",)),
+        (read_robot, (".toml",)),
+    ):
+        for suffix in suffixes:
+            with pytest.raises(InputError, match=r"cannot be read \(Permission denied\); ask for the permission to read it$"):
+                read(str(tmp_path / f"a{suffix}"))
+            with pytest.raises(InputError, match="give a shorter name"):
+                read(str(tmp_path / ("n" * 300 + suffix)))

@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from dataclasses import fields
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from ..diagnosis import Diagnosis
 from ..errors import InputError
-from ..files import put, put_text
+from ..files import put, put_text, reading
 from ..fit import Evidence, Fit
 from ..noise import Noise
 from ..profile import Profile
@@ -172,9 +173,9 @@ def _there(values: list[float | None]) -> list[float | None] | None:
     return None if all(v is None or math.isnan(v) for v in values) else values
 
 
-def _arrays_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
+def _arrays_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object], list[object] | None]:
     """What a figure needs of a RESULT.npz: force, location, width, base wrench, registration, tip force, intervals; the profile."""
-    with np.load(path, allow_pickle=False) as file:
+    with np.load(opened, allow_pickle=False) as file:
         b = _index(path, [str(n) for n in file["sample"]], sample)
         values: list[object] = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
         values.append(file["registration"][b] if "registration" in file else None)
@@ -185,9 +186,9 @@ def _arrays_of(path: Path, sample: str) -> tuple[list[object], list[object] | No
         return values, [file["profile_s"], file["profile_f"][b], file["profile_band"][b]]
 
 
-def _record_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
+def _record_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object], list[object] | None]:
     """The same of a RESULT.json."""
-    results = json.loads(path.read_text(encoding="utf-8"))["results"]
+    results = json.load(opened)["results"]
     record = results[_index(path, [str(r["sample"]) for r in results], sample)]
     loads, wrench = record["loads"], record["base_wrench"]
     values: list[object] = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
@@ -206,10 +207,16 @@ def _record_of(path: Path, sample: str) -> tuple[list[object], list[object] | No
 def read_fit(path: str | Path, sample: str) -> Fit:
     """One sample of a RESULT.json or RESULT.npz. Errors: InputError naming file, sample and remedy."""
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
+    with reading(path):
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
+        with path.open("rb") as opened:
+            return _read_fit(path, opened, sample)
+
+
+def _read_fit(path: Path, opened: IO[bytes], sample: str) -> Fit:
     try:
-        values, stored = (_arrays_of if path.suffix == ".npz" else _record_of)(path, sample)
+        values, stored = (_arrays_of if path.suffix == ".npz" else _record_of)(path, opened, sample)
         *loads, wrench, zeta, tip, interval = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in values]
         profile = None if stored is None else Profile(*(torch.tensor(np.array(v, dtype=float)) for v in stored))
         force, location, width = (t.reshape(-1, 2) if i == 0 else t for i, t in enumerate(loads) if t is not None)

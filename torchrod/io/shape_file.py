@@ -7,12 +7,13 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
 
 from ..errors import InputError
-from ..files import put_text
+from ..files import put_text, reading
 from ..geometry import too_far, too_short
 from ..measurement import Markers
 from ..robot import Robot
@@ -32,11 +33,13 @@ class Shapes:
 def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     """Markers from a CSV or NPZ file (docs/files.md), checked against the robot. Errors: InputError naming file and remedy."""
     path = Path(path)
-    if "\0" in str(path) or not path.is_file():
-        raise InputError(f"{path}: no such file; check the path")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
-    shapes = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
+    with reading(path):
+        if "\0" in str(path) or not path.is_file():
+            raise InputError(f"{path}: no such file; check the path")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
+        with path.open("rb") as file:
+            shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
     markers, L = shapes.markers, robot.rod.length
     outside = (markers.s < -1e-9) | (markers.s > L * (1 + 1e-9))
     if bool(outside.any()):
@@ -69,10 +72,10 @@ def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: s
         )
 
 
-def _read_npz(path: Path) -> Shapes:
+def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {key: np.asarray(file[key]) for key in file.files}
+        with np.load(file, allow_pickle=False) as arrays:
+            data = {key: np.asarray(arrays[key]) for key in arrays.files}
     except (ValueError, TypeError, AttributeError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: is not an NPZ of plain numbers ({reason}); save numeric arrays only") from None
@@ -106,11 +109,10 @@ def _read_npz(path: Path) -> Shapes:
     return Shapes(markers, [str(i) for i in range(B)])
 
 
-def _read_csv(path: Path) -> Shapes:
+def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            numbered = [(reader.line_num, row) for row in reader if row]
+        reader = csv.reader(io.TextIOWrapper(file, newline="", encoding="utf-8-sig"))
+        numbered = [(reader.line_num, row) for row in reader if row]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: is not a CSV text file; expected the header s,x,y,z") from None
     header = [name.strip() for name in numbered[0][1]] if numbered else []
