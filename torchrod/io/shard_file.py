@@ -24,7 +24,7 @@ from torch import Tensor
 
 from ..dataset import ARRAYS, SCHEMA, DatasetSpec, digest
 from ..errors import InputError
-from ..files import put
+from ..files import put, writing
 from ..robot import Robot
 from ..rod import Rod
 from ..tendons import Tendon, Tendons
@@ -87,15 +87,11 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
-    """Make the folder, or see that what it holds belongs to this specification. Errors: InputError otherwise."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give a folder")
-    if not folder.resolve().parent.is_dir():
-        raise InputError(f"{folder}: the folder around it does not exist; create it first")
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
+    """Make the folder and those around it, or see that what it holds belongs to this specification. Errors: InputError otherwise."""
+    with writing(folder):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file; give a folder")
+        folder.mkdir(parents=True, exist_ok=True)
     for path in (folder / MANIFEST, *sorted(folder.glob("shard-*.json"))):
         content = _read_json(path)
         if content is not None and content.get("spec_sha256") != spec.sha256():
