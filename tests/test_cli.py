@@ -11,7 +11,10 @@ import pytest
 
 from tests.conftest import reference
 from tests.robots import csv_of, toml_of
+from torchrod import bounds, read_robot
 from torchrod.cli import main
+from torchrod.observability_figure import Layout, draw_observability
+from torchrod.placement import even_layout
 
 CASES = {case["name"]: case for case in reference("shape")}
 ROD = toml_of(CASES["passive-point-0"]["robot"], "rod")
@@ -68,6 +71,20 @@ def test_simulate_estimate_and_plot(tmp_path, capsys):
     assert first[:8] == b"\x89PNG\r\n\x1a\n"
     assert main(["plot", robot, shape, result, "--out", figure]) == 0
     assert len(Path(figure).read_bytes()) > 20_000
+
+
+def test_a_name_with_a_dollar_is_drawn(tmp_path, monkeypatch):
+    """Matplotlib would take it for mathematics, and this for a mistake in it."""
+    monkeypatch.chdir(tmp_path)
+    name = "two $^_$ rods"
+    Path("r.toml").write_text(toml_of(CASES["passive-point-0"]["robot"], name))
+    Path("s.csv").write_text("sample,s,x,y,z\n" + "".join(f"{name},{0.1 * i:g},{1e-3 * i},0,{0.1 * i:g}\n" for i in range(1, 5)))
+    assert main(["estimate", "r.toml", "s.csv", "--out", "e.json", "--plot", "e.png", "--steps", "10"]) == 0
+    assert main(["plot", "r.toml", "s.csv", "e.json", "--sample", name, "--out", "p.svg"]) == 0
+    assert main(["observability", "r.toml", "--markers", "3", "--out", "o.png"]) == 0
+    robot = read_robot("r.toml")
+    s = even_layout(robot, 3)
+    draw_observability("o.svg", [Layout(name, s, bounds(robot, s, 1e-3, 1.0))] * 2, 0.4, name)
 
 
 def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):

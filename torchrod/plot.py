@@ -208,7 +208,7 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
     draw_on(axes, robot, fit, markers, sample)
     panels = [figure.add_subplot(grid[i, 1]) for i in range(3)]
     draw_profile_on(panels, fit, robot.rod.length)
-    figure.suptitle(textwrap.fill(title, 120), fontsize=13)
+    figure.suptitle(textwrap.fill(title, 120), fontsize=13, parse_math=False)  # a name may hold a $
     names = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     names |= dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
     figure.legend(names.values(), names.keys(), loc="outside lower center", ncols=5, frameon=False, fontsize=11)

@@ -87,7 +87,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
-    """Make the folder and those around it, or see that what it holds belongs to this specification. Errors: InputError otherwise."""
+    """Make the folder and those around it, or see that it holds shards of this specification. Errors: InputError otherwise."""
     with writing(folder):
         if folder.exists() and not folder.is_dir():
             raise InputError(f"{folder}: is a file; give a folder")
