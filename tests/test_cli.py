@@ -4,14 +4,16 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.conftest import reference
 from tests.robots import csv_of, toml_of
-from torchrod import bounds, read_robot
+from torchrod import Model, PointCoordinates, bounds, estimate, read_robot, read_shapes
 from torchrod.cli import main
 from torchrod.observability_figure import Layout, draw_observability
 from torchrod.placement import even_layout
@@ -206,6 +208,9 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
         (dict(s=np.array([0.1, 0.2]), positions=np.zeros((1, 2, 3)), offsets=np.zeros((3, 3))), "expected (P, 3)"),
         (dict(s=np.array([0.1, 0.1]), positions=np.zeros((1, 2, 3))), "two markers at s = 0.1"),
         (dict(s=np.array(["a", "b"]), positions=np.zeros((1, 2, 3))), "does not hold numbers"),
+        (dict(s=np.zeros(0), positions=np.zeros((1, 0, 3))), "holds no marker"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((0, 2, 3))), "holds no marker"),
+        (dict(s=np.array([0.1, 0.400001]), positions=np.zeros((1, 2, 3))), "outside the rod"),
         (dict(s=np.array([0.1, np.nan]), positions=np.zeros((1, 2, 3))), "not finite"),
     ],
 )
@@ -216,6 +221,20 @@ def test_bad_npz(tmp_path, capsys, arrays, words):
     captured = capsys.readouterr()
     assert words in captured.err
     assert captured.err.count("\n") == 1
+
+
+def test_the_tip_in_single_precision_is_the_tip(tmp_path):
+    """0.3 m is 0.30000001 there; from a file and in the library."""
+    (tmp_path / "r.toml").write_text(ROD.replace("length = 0.4", "length = 0.3"))
+    robot, s = read_robot(tmp_path / "r.toml"), np.linspace(0.1, 0.3, 5, dtype=np.float32)
+    assert float(s[-1]) > 0.3
+    npz(tmp_path / "s.npz", s=s, positions=np.stack([0 * s, 0 * s, s], -1)[None])
+    markers = read_shapes(tmp_path / "s.npz", robot).markers
+    assert float(markers.s[-1]) == 0.3
+    model = Model(robot, PointCoordinates(1, 0.3, robot.rod.force_scale), steps=10)
+    exact, beyond = (estimate(model, replace(markers, s=x), 1e-3) for x in (markers.s, torch.from_numpy(s.astype(float))))
+    assert beyond.accepted.all()
+    assert torch.allclose(exact.base_wrench, beyond.base_wrench, atol=1e-6)
 
 
 def test_a_rod_of_400_metres_gets_a_warning_and_an_answer(tmp_path, capsys):

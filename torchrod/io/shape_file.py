@@ -20,6 +20,7 @@ from ..robot import Robot
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
+TIP = 1e-6  # of the length: so far beyond it, a marker is at the tip, in single precision
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
         with path.open("rb") as file:
             shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
     markers, L = shapes.markers, robot.rod.length
-    outside = (markers.s < -1e-9) | (markers.s > L * (1 + 1e-9))
+    outside = (markers.s < -1e-9) | (markers.s > L * (1 + TIP))
     if bool(outside.any()):
         hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
@@ -90,6 +91,8 @@ def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
             raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
     data = {key: value.astype(np.float64) for key, value in data.items()}
     P, B = data["s"].size, len(data["positions"]) if data["positions"].ndim else 0
+    if not P or not data["positions"].size:
+        raise InputError(f"{path}: holds no marker; give at least one in s (P,) and one sample of it in positions (B, P, 3)")
     shapes = {
         "s": (P,),
         "positions": (B, P, 3),
