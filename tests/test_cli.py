@@ -152,7 +152,7 @@ BAD = {
     "output suffix": (ROD, STRAIGHT, ["--out", "result.txt"], "end in .json or .npz"),
     "figure suffix": (ROD, STRAIGHT, ["--plot", "figure.xyz"], "end in .png"),
     "output is a folder": (ROD, STRAIGHT, ["--out", "folder.json"], "is a folder"),
-    "checkpoint": (ROD, STRAIGHT, ["--warm-start", "x.safetensors"], "no such file"),
+    "checkpoint": (ROD, STRAIGHT, ["--warm-start", "x.safetensors"], "torchrod: x.safetensors: no such file"),
     "noise below round-off": (ROD, STRAIGHT, ["--noise", "1e-200"], "from 1e-9 to 1"),
     "locations twice": (ROD, STRAIGHT, ["--location", "0.2", "0.2"], "give it once"),
     "locations and contacts": (ROD, STRAIGHT, ["--contacts", "1", "--location", "0.1", "0.2"], "one --location per load"),

@@ -97,6 +97,8 @@ def estimate(options: Namespace) -> None:
     try:
         markers, noise, found = _with_noise(noise, [c.model for c in candidates], shapes.markers, settings)
         result, evidence, markers, fitted_by = _fitted(options, candidates, markers, noise, settings)
+    except InputError:  # names its own file
+        raise
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     result = result if found is None else found.judged(result)
