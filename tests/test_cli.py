@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -105,12 +106,23 @@ def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
     assert bent["accepted"]
 
 
-def test_help_imports_neither_torch_nor_lightning():
-    code = "import sys; from torchrod.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+@pytest.mark.parametrize("module", ["torchrod", "torchrod.cli"])
+def test_python_m_is_the_command(module):
+    command = [sys.executable, "-m", module]
+    done = subprocess.run([*command, "estimate", "no.toml", "no.csv"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("torchrod: no.toml: cannot be read")
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"torchrod {version('torchrod')}\n")
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_imports_neither_torch_nor_lightning(option):
+    code = f"import sys; from torchrod.cli import main\ntry: main([{option!r}])\nexcept SystemExit: pass\n"
     code += "bad = {'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules); assert not bad, bad"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "estimate" in done.stdout
+    assert ("estimate" if option == "--help" else version("torchrod")) in done.stdout
 
 
 def npz(path: Path, **arrays) -> None:
