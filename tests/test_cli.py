@@ -133,6 +133,7 @@ BAD = {
     "missing robot": (None, STRAIGHT, [], "robot.toml: cannot be read"),
     "missing shapes": (ROD, None, [], "shapes.csv: no such file"),
     "not toml": ("length = = 3", STRAIGHT, [], "(Invalid value (at line 1, column 10)); correct that place"),
+    "name": ("name = [1, 2]\n" + ROD.split("\n", 1)[1], STRAIGHT, [], "robot.toml: name is [1, 2]; it must be a text"),
     "no rod": ("name = 'x'", STRAIGHT, [], "has no [rod] table"),
     "unknown key": (ROD.replace("diameter", "diametre"), STRAIGHT, [], "unknown key 'diametre'"),
     "missing key": (ROD.replace("diameter", "#"), STRAIGHT, [], "rod.diameter is missing"),
@@ -268,6 +269,8 @@ def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
         (["--displacement", "0.001", "0.001"], "give one per tendon"),
         (["--displacement", ".nan"], "must be finite"),
         (["--tension", "1", "--at", "0.1", "0.9"], "lie on the rod"),
+        (["--tension", "1", "--at", "0.1", "--markers", "5"], "--markers and --at both say"),
+        (["--tension", "1", "--markers", "0"], "from 1 to 10000"),
         (["--tension", "1", "--point", "0.1", "x", "0"], "three numbers"),
         (["--tension", "1", "--point", "0.9", "1", "0"], "must lie on the rod"),
     ):

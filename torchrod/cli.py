@@ -104,7 +104,7 @@ def _simulate_parser() -> ArgumentParser:
     _number_list(parser, "--tip-moment", "X Y Z (N m, base frame)", 3)
     _number_list(parser, "--tension", "tensions T1 T2 ... (N)")
     _number_list(parser, "--displacement", "instead: how far each tendon is pulled out D1 D2 ... (m); a slack one carries nothing")
-    parser.add_argument("--markers", type=int, default=20, help="number of markers, evenly spaced, the last at the tip")
+    parser.add_argument("--markers", type=int, default=None, help="number of markers, evenly spaced, the last at the tip (20)")
     _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to every coordinate (m)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")

@@ -113,8 +113,11 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
     gravity = torch.tensor(as_numbers(f"{path}: rod.gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3), dtype=DTYPE)
     if bool(gravity.any()) and float(rod.mass_per_length) == 0:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
+    name = content.get("name", path.stem)
+    if not isinstance(name, str):
+        raise InputError(f"{path}: name is {name!r}; it must be a text in quotes")
     listed = content.get("tendons", [])
     if not isinstance(listed, list):
         raise InputError(f"{path}: tendons must be an array of tables, [[tendons]]")
     tendons = Tendons(tuple(_tendon(f"{path}: tendons[{i}]", t, rod.length) for i, t in enumerate(listed)))
-    return Robot(rod, tendons, gravity, str(content.get("name", path.stem)))
+    return Robot(rod, tendons, gravity, name)
