@@ -1,5 +1,6 @@
 """The command line as a user meets it: the reference shapes, the files, and what it says of bad input."""
 
+import io
 import json
 import math
 import subprocess
@@ -18,6 +19,7 @@ from torchrod import Model, PointCoordinates, bounds, estimate, read_robot, read
 from torchrod.cli import main
 from torchrod.observability_figure import Layout, draw_observability
 from torchrod.placement import even_layout
+from torchrod.progress import bar
 
 CASES = {case["name"]: case for case in reference("shape")}
 ROD = toml_of(CASES["passive-point-0"]["robot"], "rod")
@@ -106,6 +108,32 @@ def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
     assert bent["accepted"]
 
 
+def test_the_hypothesis_of_an_npz_has_a_name(tmp_path):
+    (tmp_path / "r.toml").write_text(ROD)
+    (tmp_path / "s.csv").write_text(csv_of(CASES["passive-point-4"]))
+    paths = [str(tmp_path / name) for name in ("r.toml", "s.csv")]
+    for out in ("e.npz", "e.json"):
+        options = ["--contacts", "auto", "--noise", "auto", "--steps", "20", "--out", str(tmp_path / out)]
+        assert main(["estimate", *paths, *options]) == 0
+    (record,) = json.loads((tmp_path / "e.json").read_text())["results"]
+    with np.load(tmp_path / "e.npz", allow_pickle=False) as arrays:
+        assert arrays["hypotheses"][arrays["hypothesis"][0]] == record["evidence"]["chosen"]
+        assert arrays["hypotheses"].tolist() == list(record["evidence"]["bic"])
+        assert arrays["bic"].shape == arrays["bic_foreseen"].shape == (1, len(arrays["hypotheses"]))
+        assert arrays["noise"].shape == arrays["noise_std"].shape == (1,)
+
+
+def test_progress_is_drawn_on_a_terminal_only(monkeypatch):
+    """Where stderr goes to a file, a bar would be thousands of lines."""
+    with bar(3, "contacts") as shown:
+        assert shown.disable
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with bar(3, "contacts") as shown:
+        assert not shown.disable
+
+
 @pytest.mark.parametrize("module", ["torchrod", "torchrod.cli"])
 def test_python_m_is_the_command(module):
     command = [sys.executable, "-m", module]
@@ -177,6 +205,7 @@ BAD = {
         "symmetric positive",
     ),
     "two sections": (SOFT.format(K_bt="[1, 1, 1]") + "diameter = 0.001\n", STRAIGHT, [], "either the stiffnesses or"),
+    "two rows of stiffness": (SOFT.format(K_bt="[[1, 0, 0], [0, 1, 0]]"), STRAIGHT, [], "or three rows of three numbers"),
     "short curvature": (ROD + "reference_curvature = [1, 2]\n", STRAIGHT, [], "[1, 2]; it must be a list of 3 numbers"),
     "short routing": (
         TENDON.replace("offset = [0.007, 0.0]", "routing = [[0.1, 0.007, 0], [0.2, 0.007, 0]]"),

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from jsonargparse import Namespace
 from torch import Tensor
-from tqdm import tqdm
 
 from .actuation import solve_displacement
 from .arguments import writable
@@ -17,6 +16,7 @@ from .io import Shapes, has_shard, prepare_folder, read_dataset_spec, read_robot
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers
 from .production import produce
+from .progress import bar
 from .robot import Robot
 from .rod import DTYPE
 from .statics import Equilibrium, solve_shape
@@ -128,10 +128,8 @@ def simulate_dataset(options: Namespace) -> None:
     missing = [index for index in mine if not has_shard(folder, spec, index)]
     kept = sum(spec.samples_in(index) for index in mine) - sum(spec.samples_in(index) for index in missing)
     total, name = sum(map(spec.samples_in, mine)), f"{len(mine)} shards"
-    with tqdm(
-        total=total, initial=kept, desc=name, unit="sample", unit_scale=True, delay=1.0, leave=False, dynamic_ncols=True
-    ) as bar:
-        produce(spec, folder, missing, options.workers or torch.get_num_threads(), options.scheduler, bar.update)
+    with bar(total, name, kept) as shown:
+        produce(spec, folder, missing, options.workers or torch.get_num_threads(), options.scheduler, shown.update)
     digest = write_manifest(folder, spec)
     done = f"digest {digest}" if digest else f"the manifest follows when all {spec.shards} shards are there"
     print(f"{folder}: shards made {len(missing)}, kept {len(mine) - len(missing)}; {done}")  # noqa: T201

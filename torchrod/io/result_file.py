@@ -149,17 +149,19 @@ def write_result(
             texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
         put_text(path, f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n")
         return
+    names = {"sample": np.array(samples), "robot": np.array(robot)}
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
+        names["hypotheses"] = np.array(evidence.names)
     for name in ("magnitude_location_covariance", "location_interval"):
         arrays[name] = getattr(estimate, name)
     if noise is not None:
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
         arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
-    named = {"sample": np.array(samples), "robot": np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}}
-    put(path, lambda file: np.savez_compressed(file, **named))  # pyright: ignore[reportArgumentType]
+    content = names | {k: v.numpy() for k, v in arrays.items() if v is not None}
+    put(path, lambda file: np.savez_compressed(file, **content))  # pyright: ignore[reportArgumentType]
 
 
 def _index(path: Path, names: list[str], sample: str) -> int:

@@ -33,8 +33,10 @@ def _stiffness(where: str, value: object) -> torch.Tensor:
     """Three numbers (the diagonal) or three rows of three: symmetric positive definite."""
     if isinstance(value, list) and len(value) == 3 and all(isinstance(row, list) for row in value):
         K = torch.tensor([as_numbers(f"{where}[{i}]", row, 3) for i, row in enumerate(value)], dtype=DTYPE)
-    else:
+    elif isinstance(value, list) and len(value) == 3:
         K = torch.diag(torch.tensor(as_numbers(where, value, 3), dtype=DTYPE))
+    else:
+        raise InputError(f"{where} is {value!r}; it must be three numbers (the diagonal) or three rows of three numbers")
     if not torch.allclose(K, K.mT, rtol=1e-6, atol=0) or int(torch.linalg.cholesky_ex(K).info) != 0:
         raise InputError(f"{where} must be symmetric positive definite, in N (K_se) or N m^2 (K_bt)")
     return K
