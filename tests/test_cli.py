@@ -1,17 +1,25 @@
 """The command line as a user meets it: the reference shapes, the files, and what it says of bad input."""
 
+import io
 import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from tests.conftest import reference
 from tests.robots import csv_of, toml_of
+from torchrod import Model, PointCoordinates, bounds, estimate, read_robot, read_shapes
 from torchrod.cli import main
+from torchrod.observability_figure import Layout, draw_observability
+from torchrod.placement import even_layout
+from torchrod.progress import bar
 
 CASES = {case["name"]: case for case in reference("shape")}
 ROD = toml_of(CASES["passive-point-0"]["robot"], "rod")
@@ -70,6 +78,20 @@ def test_simulate_estimate_and_plot(tmp_path, capsys):
     assert len(Path(figure).read_bytes()) > 20_000
 
 
+def test_a_name_with_a_dollar_is_drawn(tmp_path, monkeypatch):
+    """Matplotlib would take it for mathematics, and this for a mistake in it."""
+    monkeypatch.chdir(tmp_path)
+    name = "two $^_$ rods"
+    Path("r.toml").write_text(toml_of(CASES["passive-point-0"]["robot"], name))
+    Path("s.csv").write_text("sample,s,x,y,z\n" + "".join(f"{name},{0.1 * i:g},{1e-3 * i},0,{0.1 * i:g}\n" for i in range(1, 5)))
+    assert main(["estimate", "r.toml", "s.csv", "--out", "e.json", "--plot", "e.png", "--steps", "10"]) == 0
+    assert main(["plot", "r.toml", "s.csv", "e.json", "--sample", name, "--out", "p.svg"]) == 0
+    assert main(["observability", "r.toml", "--markers", "3", "--out", "o.png"]) == 0
+    robot = read_robot("r.toml")
+    s = even_layout(robot, 3)
+    draw_observability("o.svg", [Layout(name, s, bounds(robot, s, 1e-3, 1.0))] * 2, 0.4, name)
+
+
 def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
     """Two samples in one file: each decides for itself, and a missing marker is an empty cell."""
     pushed = CASES["passive-point-4"]
@@ -86,12 +108,49 @@ def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
     assert bent["accepted"]
 
 
-def test_help_imports_neither_torch_nor_lightning():
-    code = "import sys; from torchrod.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+def test_the_hypothesis_of_an_npz_has_a_name(tmp_path):
+    (tmp_path / "r.toml").write_text(ROD)
+    (tmp_path / "s.csv").write_text(csv_of(CASES["passive-point-4"]))
+    paths = [str(tmp_path / name) for name in ("r.toml", "s.csv")]
+    for out in ("e.npz", "e.json"):
+        options = ["--contacts", "auto", "--noise", "auto", "--steps", "20", "--out", str(tmp_path / out)]
+        assert main(["estimate", *paths, *options]) == 0
+    (record,) = json.loads((tmp_path / "e.json").read_text())["results"]
+    with np.load(tmp_path / "e.npz", allow_pickle=False) as arrays:
+        assert arrays["hypotheses"][arrays["hypothesis"][0]] == record["evidence"]["chosen"]
+        assert arrays["hypotheses"].tolist() == list(record["evidence"]["bic"])
+        assert arrays["bic"].shape == arrays["bic_foreseen"].shape == (1, len(arrays["hypotheses"]))
+        assert arrays["noise"].shape == arrays["noise_std"].shape == (1,)
+
+
+def test_progress_is_drawn_on_a_terminal_only(monkeypatch):
+    """Where stderr goes to a file, a bar would be thousands of lines."""
+    with bar(3, "contacts") as shown:
+        assert shown.disable
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with bar(3, "contacts") as shown:
+        assert not shown.disable
+
+
+@pytest.mark.parametrize("module", ["torchrod", "torchrod.cli"])
+def test_python_m_is_the_command(module):
+    command = [sys.executable, "-m", module]
+    done = subprocess.run([*command, "estimate", "no.toml", "no.csv"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("torchrod: no.toml: cannot be read")
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"torchrod {version('torchrod')}\n")
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_imports_neither_torch_nor_lightning(option):
+    code = f"import sys; from torchrod.cli import main\ntry: main([{option!r}])\nexcept SystemExit: pass\n"
     code += "bad = {'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules); assert not bad, bad"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "estimate" in done.stdout
+    assert ("estimate" if option == "--help" else version("torchrod")) in done.stdout
 
 
 def npz(path: Path, **arrays) -> None:
@@ -101,7 +160,8 @@ def npz(path: Path, **arrays) -> None:
 BAD = {
     "missing robot": (None, STRAIGHT, [], "robot.toml: cannot be read"),
     "missing shapes": (ROD, None, [], "shapes.csv: no such file"),
-    "not toml": ("length = = 3", STRAIGHT, [], "not valid TOML"),
+    "not toml": ("length = = 3", STRAIGHT, [], "(Invalid value (at line 1, column 10)); correct that place"),
+    "name": ("name = [1, 2]\n" + ROD.split("\n", 1)[1], STRAIGHT, [], "robot.toml: name is [1, 2]; it must be a text"),
     "no rod": ("name = 'x'", STRAIGHT, [], "has no [rod] table"),
     "unknown key": (ROD.replace("diameter", "diametre"), STRAIGHT, [], "unknown key 'diametre'"),
     "missing key": (ROD.replace("diameter", "#"), STRAIGHT, [], "rod.diameter is missing"),
@@ -133,7 +193,7 @@ BAD = {
     "output suffix": (ROD, STRAIGHT, ["--out", "result.txt"], "end in .json or .npz"),
     "figure suffix": (ROD, STRAIGHT, ["--plot", "figure.xyz"], "end in .png"),
     "output is a folder": (ROD, STRAIGHT, ["--out", "folder.json"], "is a folder"),
-    "checkpoint": (ROD, STRAIGHT, ["--warm-start", "x.safetensors"], "no such file"),
+    "checkpoint": (ROD, STRAIGHT, ["--warm-start", "x.safetensors"], "torchrod: x.safetensors: no such file"),
     "noise below round-off": (ROD, STRAIGHT, ["--noise", "1e-200"], "from 1e-9 to 1"),
     "locations twice": (ROD, STRAIGHT, ["--location", "0.2", "0.2"], "give it once"),
     "locations and contacts": (ROD, STRAIGHT, ["--contacts", "1", "--location", "0.1", "0.2"], "one --location per load"),
@@ -145,6 +205,7 @@ BAD = {
         "symmetric positive",
     ),
     "two sections": (SOFT.format(K_bt="[1, 1, 1]") + "diameter = 0.001\n", STRAIGHT, [], "either the stiffnesses or"),
+    "two rows of stiffness": (SOFT.format(K_bt="[[1, 0, 0], [0, 1, 0]]"), STRAIGHT, [], "or three rows of three numbers"),
     "short curvature": (ROD + "reference_curvature = [1, 2]\n", STRAIGHT, [], "[1, 2]; it must be a list of 3 numbers"),
     "short routing": (
         TENDON.replace("offset = [0.007, 0.0]", "routing = [[0.1, 0.007, 0], [0.2, 0.007, 0]]"),
@@ -189,6 +250,9 @@ def test_bad_input_is_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
         (dict(s=np.array([0.1, 0.2]), positions=np.zeros((1, 2, 3)), offsets=np.zeros((3, 3))), "expected (P, 3)"),
         (dict(s=np.array([0.1, 0.1]), positions=np.zeros((1, 2, 3))), "two markers at s = 0.1"),
         (dict(s=np.array(["a", "b"]), positions=np.zeros((1, 2, 3))), "does not hold numbers"),
+        (dict(s=np.zeros(0), positions=np.zeros((1, 0, 3))), "holds no marker"),
+        (dict(s=np.array([0.1, 0.2]), positions=np.zeros((0, 2, 3))), "holds no marker"),
+        (dict(s=np.array([0.1, 0.400001]), positions=np.zeros((1, 2, 3))), "outside the rod"),
         (dict(s=np.array([0.1, np.nan]), positions=np.zeros((1, 2, 3))), "not finite"),
     ],
 )
@@ -199,6 +263,20 @@ def test_bad_npz(tmp_path, capsys, arrays, words):
     captured = capsys.readouterr()
     assert words in captured.err
     assert captured.err.count("\n") == 1
+
+
+def test_the_tip_in_single_precision_is_the_tip(tmp_path):
+    """0.3 m is 0.30000001 there; from a file and in the library."""
+    (tmp_path / "r.toml").write_text(ROD.replace("length = 0.4", "length = 0.3"))
+    robot, s = read_robot(tmp_path / "r.toml"), np.linspace(0.1, 0.3, 5, dtype=np.float32)
+    assert float(s[-1]) > 0.3
+    npz(tmp_path / "s.npz", s=s, positions=np.stack([0 * s, 0 * s, s], -1)[None])
+    markers = read_shapes(tmp_path / "s.npz", robot).markers
+    assert float(markers.s[-1]) == 0.3
+    model = Model(robot, PointCoordinates(1, 0.3, robot.rod.force_scale), steps=10)
+    exact, beyond = (estimate(model, replace(markers, s=x), 1e-3) for x in (markers.s, torch.from_numpy(s.astype(float))))
+    assert beyond.accepted.all()
+    assert torch.allclose(exact.base_wrench, beyond.base_wrench, atol=1e-6)
 
 
 def test_a_rod_of_400_metres_gets_a_warning_and_an_answer(tmp_path, capsys):
@@ -220,6 +298,8 @@ def test_simulate_refuses_what_it_cannot_do(tmp_path, capsys):
         (["--displacement", "0.001", "0.001"], "give one per tendon"),
         (["--displacement", ".nan"], "must be finite"),
         (["--tension", "1", "--at", "0.1", "0.9"], "lie on the rod"),
+        (["--tension", "1", "--at", "0.1", "--markers", "5"], "--markers and --at both say"),
+        (["--tension", "1", "--markers", "0"], "from 1 to 10000"),
         (["--tension", "1", "--point", "0.1", "x", "0"], "three numbers"),
         (["--tension", "1", "--point", "0.9", "1", "0"], "must lie on the rod"),
     ):

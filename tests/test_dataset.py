@@ -259,6 +259,11 @@ def test_rejected_draws_are_replaced_or_refused():
         simulate_shard(spec(robots=(robot,), tension=(4 * CRUSHING, 5 * CRUSHING)), 0)
 
 
+def test_the_folders_around_a_data_set_are_made(tmp_path, made):
+    made("out/new/d")
+    assert (tmp_path / "out" / "new" / "d" / "manifest.json").is_file()
+
+
 def test_another_data_set_is_not_mixed_in(tmp_path, made, capsys):
     made("d")
     before = {p.name: p.read_bytes() for p in (tmp_path / "d").iterdir()}
@@ -267,7 +272,7 @@ def test_another_data_set_is_not_mixed_in(tmp_path, made, capsys):
     for options, words in (
         ([str(tmp_path / "d"), "--seed", "5"], "another specification"),
         ([str(tmp_path / "d"), "--samples", "70"], "another specification"),
-        ([str(tmp_path / "no" / "d")], "create it first"),
+        ([str(tmp_path / "file" / "d")], "Not a directory"),
         ([str(tmp_path / "file")], "give a folder"),
         ([str(tmp_path / "e"), "--shard", "2/2"], "from 0 to N - 1"),
         ([str(tmp_path / "e"), "--shard", "first"], "must be I/N"),

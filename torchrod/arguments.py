@@ -1,9 +1,11 @@
 """Checks of arguments that several commands share. Each refusal is one sentence with the remedy."""
 
 import math
+import os
 from pathlib import Path
 
 from .errors import InputError
+from .files import writing
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 COARSEST = 0.25  # of the length: with more noise no shape shows
@@ -21,10 +23,11 @@ def writable(path: str | None, suffixes: tuple[str, ...]) -> None:
         return
     if Path(path).suffix not in suffixes:
         raise InputError(f"{path}: cannot write this kind of file; let its name end in {' or '.join(suffixes)}")
-    if not Path(path).resolve().parent.is_dir():
-        raise InputError(f"{path}: its folder does not exist; create it first")
-    if Path(path).is_dir():
-        raise InputError(f"{path}: is a folder; give a file name")
+    with writing(path):
+        if not Path(os.path.realpath(path)).parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist; create it first")
+        if Path(path).is_dir():
+            raise InputError(f"{path}: is a folder; give a file name")
 
 
 def noise_or_auto(value: str, length: float) -> float | None:

@@ -25,7 +25,7 @@ def check(model: Model, markers: Markers, noise: float) -> None:
         raise ValueError(f"noise is {noise} m; it must be positive")
     if len(markers.s) == 0 or len(markers.positions) == 0:
         raise ValueError("there are no markers; give at least one sample with markers")
-    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + 1e-9)).any()):
+    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + 1e-6)).any()):
         raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
     if 3 * len(markers.s) < model.free_size:
         raise ValueError(

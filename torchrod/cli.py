@@ -1,6 +1,7 @@
 """The command line. Nothing heavy is imported until a command runs, so that --help answers at once."""
 
 import importlib
+import importlib.metadata
 import sys
 import warnings
 from typing import NoReturn
@@ -103,7 +104,7 @@ def _simulate_parser() -> ArgumentParser:
     _number_list(parser, "--tip-moment", "X Y Z (N m, base frame)", 3)
     _number_list(parser, "--tension", "tensions T1 T2 ... (N)")
     _number_list(parser, "--displacement", "instead: how far each tendon is pulled out D1 D2 ... (m); a slack one carries nothing")
-    parser.add_argument("--markers", type=int, default=20, help="number of markers, evenly spaced, the last at the tip")
+    parser.add_argument("--markers", type=int, default=None, help="number of markers, evenly spaced, the last at the tip (20)")
     _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to every coordinate (m)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
@@ -148,8 +149,17 @@ COMMANDS = {
 HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
 
 
+def _version() -> str:
+    """Of what is installed; a copy beside it that is not says so."""
+    try:
+        return importlib.metadata.version("torchrod")
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
 def _parser() -> ArgumentParser:
-    parser = _Parser(prog="torchrod", description="Forces from shape: the loads on a continuum robot from its measured markers.")
+    about = "Forces from shape: the loads on a continuum robot from its measured markers."
+    parser = _Parser(prog="torchrod", description=about, version=_version())
     commands = parser.add_subcommands(required=True)
     for name, (make, help) in COMMANDS.items():
         commands.add_subcommand(name, make(), help=help)
@@ -177,3 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"torchrod: {error}", file=sys.stderr)  # noqa: T201
         return 2
     return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

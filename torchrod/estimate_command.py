@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import torch
 from jsonargparse import Namespace
-from tqdm import tqdm
 
 from .arguments import FIGURE_SUFFIXES, noise_or_auto, positive, writable
 from .coordinates import GaussianCoordinates
@@ -28,6 +27,7 @@ from .io import (
 from .measurement import Markers, Model
 from .noise import Noise, estimate_noise_among
 from .profile import Profile, joined_profile
+from .progress import bar
 from .result import Estimate
 from .robot import Robot
 from .selection import Hypothesis, same_kind, select
@@ -97,6 +97,8 @@ def estimate(options: Namespace) -> None:
     try:
         markers, noise, found = _with_noise(noise, [c.model for c in candidates], shapes.markers, settings)
         result, evidence, markers, fitted_by = _fitted(options, candidates, markers, noise, settings)
+    except InputError:  # names its own file
+        raise
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     result = result if found is None else found.judged(result)
@@ -131,18 +133,18 @@ def _fitted(
 
     def fitted(candidates: list[Hypothesis], markers: Markers) -> tuple[Estimate, Evidence | None, Parts]:
         if len(candidates) > 1:
-            result, evidence = select(candidates, markers, noise, settings, start_of, _bar)
+            result, evidence = select(candidates, markers, noise, settings, start_of, bar)
             return result, evidence, [(c.model, (evidence.choice == h).nonzero().squeeze(-1)) for h, c in enumerate(candidates)]
         only = candidates[0]
-        with _bar(len(markers.positions), f"{only.contacts} contact{'s' * (only.contacts != 1)}") as bar:
-            result = run_estimate(only.model, markers, noise, settings, start_of(only.model), bar.update)
+        with bar(len(markers.positions), f"{only.contacts} contact{'s' * (only.contacts != 1)}") as shown:
+            result = run_estimate(only.model, markers, noise, settings, start_of(only.model), shown.update)
         return result, None, [(only.model, torch.arange(len(markers.positions)))]
 
     result, evidence, parts = fitted(candidates, markers)
     if not options.one_frame:
         return result, evidence, markers, parts
-    with _bar(FRAME_STEPS * len(markers.positions), "base frame") as bar:
-        frame = common_frame(parts, markers, noise, result, settings, bar.update)
+    with bar(FRAME_STEPS * len(markers.positions), "base frame") as shown:
+        frame = common_frame(parts, markers, noise, result, settings, shown.update)
     markers = frame.corrected(markers)
     plain = [replace(c, model=replace(c.model, registration=False)) for c in candidates]
     result, evidence, parts = fitted(plain, markers)
@@ -180,11 +182,6 @@ def _starts(options: Namespace, models: list[Model], markers: Markers, noise: fl
     if outside:
         warnings.warn(f"{options.warm_start}: {outside} samples lie outside of what it knows and start cold", stacklevel=2)
     return lambda model: named if named.misfit(model) is None else cold_start
-
-
-def _bar(total: int, what: str) -> tqdm:
-    """A progress bar on stderr, shown where there is more than a second of work."""
-    return tqdm(total=total, desc=what, unit="sample", delay=1.0, leave=False, dynamic_ncols=True)
 
 
 def _draw(path: str, robot: Robot, markers: Markers, result: Estimate, samples: list[str], profile: Profile | None) -> None:

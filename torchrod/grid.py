@@ -56,6 +56,7 @@ def make_grid(
     steps: int = DEFAULT_STEPS,
 ) -> Grid:
     """Nodes at 0, L, the outputs, the tendon ends and the breakpoints, filled up so that no step is longer than L / steps (m)."""
+    outputs = outputs.clamp(max=length)  # the tip in single precision lies beyond it
     fixed = torch.cat([outputs.new_tensor([0.0, length, *ends]), outputs]).sort().values
     fixed = fixed[torch.cat([torch.tensor([True]), fixed.diff() > SAME_POINT])]
     pieces = (fixed.diff() / (length / steps) - 1e-9).ceil().clamp(min=1).to(torch.int64)

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from . import fast
 from .errors import InputError
+from .files import reading
 from .kept import version
 
 SCHEMA = 1  # of the card
@@ -150,8 +151,10 @@ def load_checkpoint(path: Path) -> tuple[Network, dict[str, Any]]:
     The weights are float32 numbers; evaluated in float64, a sample's answer does not depend on how the batch was blocked.
     """
     for file in (path, path.with_suffix(".json")):
-        if not file.is_file():
-            raise InputError(f"{file}: no such file; a checkpoint is NAME.safetensors with NAME.json beside it")
+        with reading(file):
+            if not file.is_file():
+                raise InputError(f"{file}: no such file; a checkpoint is NAME.safetensors with NAME.json beside it")
+            file.open("rb").close()
     try:
         card = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
         if card["schema"] != SCHEMA:

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from torch import Tensor
 
+from .files import put
 from .observability import LOCALIZED, Observability
 from .plot import INK, LOAD, MARKER
 
@@ -54,13 +55,15 @@ def _finish(axes: Axes, layouts: list[Layout], length: float, title: str, unit: 
     _marker_rows(axes, layouts)
     axes.set_xlabel("arc length from the base, s (mm)")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper right")
+    for text in axes.legend(fontsize=8, loc="upper right").get_texts():
+        text.set_parse_math(False)  # a layout's name may hold a $
 
 
 def draw_observability(path: str | Path, layouts: list[Layout], length: float, title: str, nearest: float | None = None) -> None:
     """Write the figure: the first layout solid, one that it is compared with dashed.
 
     length: L (m). nearest: the layout was proposed for pushes from there on (m); what is nearer the base is shaded.
+    Errors: InputError where the file cannot be written.
     """
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
@@ -81,5 +84,5 @@ def draw_observability(path: str | Path, layouts: list[Layout], length: float, t
         axes.axvspan(0, 1e3 * (nearest or 0.0), color="#ececec", zorder=0, label="not asked for in the proposal")
     _finish(left, layouts, length, "Smallest push that is ...", "force (N), worst direction")
     _finish(right, layouts, length, f"How well a push of {force:.3g} N is located", "standard deviation of the location (mm)")
-    figure.suptitle(textwrap.fill(title, 120), fontsize=12)
-    figure.savefig(path, dpi=150)
+    figure.suptitle(textwrap.fill(title, 120), fontsize=12, parse_math=False)  # a name may hold a $
+    put(path, lambda file: figure.savefig(file, format=Path(path).suffix[1:] or None, dpi=150))

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
+from .files import put
 from .fit import Fit
 from .grid import DEFAULT_STEPS
 from .lie import move, rotate
@@ -195,7 +196,10 @@ def draw_profile_on(axes: Sequence[Axes], fit: Fit, length: float) -> None:
 
 
 def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int, title: str) -> None:
-    """Write the figure of one sample: the rod by `draw_on`, and beside it the loads along it by `draw_profile_on`."""
+    """Write the figure of one sample: the rod by `draw_on`, and beside it the loads along it by `draw_profile_on`.
+
+    Errors: InputError where the file cannot be written.
+    """
     figure = Figure(figsize=(13, 7), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
@@ -204,8 +208,8 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
     draw_on(axes, robot, fit, markers, sample)
     panels = [figure.add_subplot(grid[i, 1]) for i in range(3)]
     draw_profile_on(panels, fit, robot.rod.length)
-    figure.suptitle(textwrap.fill(title, 120), fontsize=13)
+    figure.suptitle(textwrap.fill(title, 120), fontsize=13, parse_math=False)  # a name may hold a $
     names = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     names |= dict(zip(*reversed(panels[-1].get_legend_handles_labels()), strict=True))
     figure.legend(names.values(), names.keys(), loc="outside lower center", ncols=5, frameon=False, fontsize=11)
-    figure.savefig(path, dpi=150)
+    put(path, lambda file: figure.savefig(file, format=Path(path).suffix[1:] or None, dpi=150))

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from jsonargparse import Namespace
 from torch import Tensor
-from tqdm import tqdm
 
 from .actuation import solve_displacement
 from .arguments import writable
@@ -17,21 +16,21 @@ from .io import Shapes, has_shard, prepare_folder, read_dataset_spec, read_robot
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers
 from .production import produce
+from .progress import bar
 from .robot import Robot
 from .rod import DTYPE
 from .statics import Equilibrium, solve_shape
 from .status import Status
+
+DEFAULT_MARKERS = 20
+MOST_MARKERS = 10_000
 
 
 def simulate(options: Namespace) -> None:
     """torchrod simulate."""
     robot = read_robot(options.robot)
     L, T = robot.rod.length, len(robot.tendons)
-    if options.at is None and not 1 <= options.markers <= 10_000:
-        raise InputError(f"--markers is {options.markers}; it must be from 1 to 10000")
-    at = options.at if options.at is not None else [L * (i + 1) / options.markers for i in range(options.markers)]
-    if any(not 0 <= s <= L for s in at) or any(b <= a for a, b in pairwise(at)):
-        raise InputError(f"--at {at}: must increase and lie on the rod, 0 to {L} m")
+    at = _places(options, L)
     _actuation(options, T)
     if not 0 <= options.seed < 2**63:
         raise InputError(f"--seed is {options.seed}; it must be from 0 to 2^63 - 1")
@@ -52,6 +51,20 @@ def simulate(options: Namespace) -> None:
     tip = [f"{v * 1e3:.2f}" for v in shape.p[0, -1].tolist()]
     pulled = f", tensions {', '.join(f'{t:.3f}' for t in tensions[0].tolist())} N" if tensions is not None else ""
     print(f"{options.out}: {len(at)} markers, the last at ({', '.join(tip)}) mm{pulled}")  # noqa: T201
+
+
+def _places(options: Namespace, L: float) -> list[float]:
+    """The markers (m) of --at or --markers."""
+    if options.at is None:
+        count = DEFAULT_MARKERS if options.markers is None else options.markers
+        if not 1 <= count <= MOST_MARKERS:
+            raise InputError(f"--markers is {count}; it must be from 1 to {MOST_MARKERS}")
+        return [L * (i + 1) / count for i in range(count)]
+    if options.markers is not None:
+        raise InputError("--markers and --at both say where the markers are; give one of them")
+    if any(not 0 <= s <= L for s in options.at) or any(b <= a for a, b in pairwise(options.at)):
+        raise InputError(f"--at {options.at}: must increase and lie on the rod, 0 to {L} m")
+    return options.at
 
 
 def _actuation(options: Namespace, tendons: int) -> None:
@@ -115,10 +128,8 @@ def simulate_dataset(options: Namespace) -> None:
     missing = [index for index in mine if not has_shard(folder, spec, index)]
     kept = sum(spec.samples_in(index) for index in mine) - sum(spec.samples_in(index) for index in missing)
     total, name = sum(map(spec.samples_in, mine)), f"{len(mine)} shards"
-    with tqdm(
-        total=total, initial=kept, desc=name, unit="sample", unit_scale=True, delay=1.0, leave=False, dynamic_ncols=True
-    ) as bar:
-        produce(spec, folder, missing, options.workers or torch.get_num_threads(), options.scheduler, bar.update)
+    with bar(total, name, kept) as shown:
+        produce(spec, folder, missing, options.workers or torch.get_num_threads(), options.scheduler, shown.update)
     digest = write_manifest(folder, spec)
     done = f"digest {digest}" if digest else f"the manifest follows when all {spec.shards} shards are there"
     print(f"{folder}: shards made {len(missing)}, kept {len(mine) - len(missing)}; {done}")  # noqa: T201

@@ -77,11 +77,11 @@ class ShapeData(LightningDataModule):
         missing = [i for i in range(self.recipe.blocks) if not (self.folder / f"{i:04d}.safetensors").is_file()]
         make = partial(make_block, self.recipe, self.folder)
         if self.workers < 2 or len(missing) < 2:
-            for i in tqdm(missing, desc="cases", unit="block", delay=1.0):
+            for i in tqdm(missing, desc="cases", unit="block", delay=1.0, disable=None):
                 make(i)
             return
         with ProcessPoolExecutor(self.workers, get_context("spawn")) as pool:
-            list(tqdm(pool.map(make, missing), total=len(missing), desc="cases", unit="block", delay=1.0))
+            list(tqdm(pool.map(make, missing), total=len(missing), desc="cases", unit="block", delay=1.0, disable=None))
 
     def setup(self, stage: str) -> None:
         """Read the blocks; the last of them are held out."""

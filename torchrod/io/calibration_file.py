@@ -1,12 +1,11 @@
 """CALIBRATION.json: what torchrod calibrate found (docs/files.md)."""
 
-import json
 import math
 from pathlib import Path
 
 from ..calibration import Calibration
-from ..errors import InputError
 from ..unloaded import MASS, OFFSET
+from .json_file import put_json
 
 CALIBRATION_SUFFIXES = (".json",)
 
@@ -51,7 +50,4 @@ def write_calibration(path: str | Path, calibration: Calibration, samples: list[
             for i, name in enumerate(c.names)
         ],
     }
-    try:
-        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
+    put_json(path, content)

@@ -1,15 +1,16 @@
 """OBSERVABILITY.json and .csv: what torchrod observability found (docs/files.md)."""
 
 import csv
-import json
+import io
 import math
 from pathlib import Path
 
 from torch import Tensor
 
-from ..errors import InputError
+from ..files import put_text
 from ..observability import FALSE_ALARM, LOCALIZED, POWER, Observability
 from ..placement import Placement
+from .json_file import put_json
 
 
 def _plain(value: float) -> float | None:
@@ -33,13 +34,11 @@ def _columns(seen: Observability) -> dict[str, Tensor]:
 def write_observability_table(path: str | Path, seen: Observability) -> None:
     """One row per place as CSV; `inf` where markers do not show it, `nan` where there is no equilibrium. Errors: InputError."""
     columns = _columns(seen)
-    try:
-        with Path(path).open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    put_text(path, text.getvalue())
 
 
 def write_observability(
@@ -78,7 +77,4 @@ def write_observability(
             "worst_location_std_m": _plain(placed.worst),
         },
     }
-    try:
-        Path(path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
+    put_json(path, content)

@@ -6,6 +6,7 @@ import zipfile
 import zlib
 from dataclasses import fields
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from ..diagnosis import Diagnosis
 from ..errors import InputError
+from ..files import put, put_text, reading
 from ..fit import Evidence, Fit
 from ..noise import Noise
 from ..profile import Profile
@@ -124,10 +126,11 @@ def write_result(
     diagnosis: Diagnosis | None = None,
     noise: Noise | None = None,
 ) -> None:
-    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays. Errors: InputError for another suffix.
+    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
+    Errors: InputError for another suffix, and where the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
@@ -144,20 +147,21 @@ def write_result(
         texts = [json.dumps(record, indent=1) for record in records]
         if profile is not None:
             texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
-        path.write_text(f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n", encoding="utf-8")
+        put_text(path, f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n")
         return
+    names = {"sample": np.array(samples), "robot": np.array(robot)}
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
+        names["hypotheses"] = np.array(evidence.names)
     for name in ("magnitude_location_covariance", "location_interval"):
         arrays[name] = getattr(estimate, name)
     if noise is not None:
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
         arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
-    np.savez_compressed(
-        path, sample=np.array(samples), robot=np.array(robot), **{k: v.numpy() for k, v in arrays.items() if v is not None}
-    )
+    content = names | {k: v.numpy() for k, v in arrays.items() if v is not None}
+    put(path, lambda file: np.savez_compressed(file, **content))  # pyright: ignore[reportArgumentType]
 
 
 def _index(path: Path, names: list[str], sample: str) -> int:
@@ -171,9 +175,9 @@ def _there(values: list[float | None]) -> list[float | None] | None:
     return None if all(v is None or math.isnan(v) for v in values) else values
 
 
-def _arrays_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
+def _arrays_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object], list[object] | None]:
     """What a figure needs of a RESULT.npz: force, location, width, base wrench, registration, tip force, intervals; the profile."""
-    with np.load(path, allow_pickle=False) as file:
+    with np.load(opened, allow_pickle=False) as file:
         b = _index(path, [str(n) for n in file["sample"]], sample)
         values: list[object] = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
         values.append(file["registration"][b] if "registration" in file else None)
@@ -184,9 +188,9 @@ def _arrays_of(path: Path, sample: str) -> tuple[list[object], list[object] | No
         return values, [file["profile_s"], file["profile_f"][b], file["profile_band"][b]]
 
 
-def _record_of(path: Path, sample: str) -> tuple[list[object], list[object] | None]:
+def _record_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object], list[object] | None]:
     """The same of a RESULT.json."""
-    results = json.loads(path.read_text(encoding="utf-8"))["results"]
+    results = json.load(opened)["results"]
     record = results[_index(path, [str(r["sample"]) for r in results], sample)]
     loads, wrench = record["loads"], record["base_wrench"]
     values: list[object] = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
@@ -205,10 +209,16 @@ def _record_of(path: Path, sample: str) -> tuple[list[object], list[object] | No
 def read_fit(path: str | Path, sample: str) -> Fit:
     """One sample of a RESULT.json or RESULT.npz. Errors: InputError naming file, sample and remedy."""
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
+    with reading(path):
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
+        with path.open("rb") as opened:
+            return _read_fit(path, opened, sample)
+
+
+def _read_fit(path: Path, opened: IO[bytes], sample: str) -> Fit:
     try:
-        values, stored = (_arrays_of if path.suffix == ".npz" else _record_of)(path, sample)
+        values, stored = (_arrays_of if path.suffix == ".npz" else _record_of)(path, opened, sample)
         *loads, wrench, zeta, tip, interval = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in values]
         profile = None if stored is None else Profile(*(torch.tensor(np.array(v, dtype=float)) for v in stored))
         force, location, width = (t.reshape(-1, 2) if i == 0 else t for i, t in enumerate(loads) if t is not None)

@@ -33,8 +33,10 @@ def _stiffness(where: str, value: object) -> torch.Tensor:
     """Three numbers (the diagonal) or three rows of three: symmetric positive definite."""
     if isinstance(value, list) and len(value) == 3 and all(isinstance(row, list) for row in value):
         K = torch.tensor([as_numbers(f"{where}[{i}]", row, 3) for i, row in enumerate(value)], dtype=DTYPE)
-    else:
+    elif isinstance(value, list) and len(value) == 3:
         K = torch.diag(torch.tensor(as_numbers(where, value, 3), dtype=DTYPE))
+    else:
+        raise InputError(f"{where} is {value!r}; it must be three numbers (the diagonal) or three rows of three numbers")
     if not torch.allclose(K, K.mT, rtol=1e-6, atol=0) or int(torch.linalg.cholesky_ex(K).info) != 0:
         raise InputError(f"{where} must be symmetric positive definite, in N (K_se) or N m^2 (K_bt)")
     return K
@@ -100,8 +102,11 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
 
 def read_robot(path: str | Path) -> Robot:
     """A robot from ROBOT.toml (docs/files.md). SI units. Errors: InputError naming file, key and remedy."""
-    path = Path(path)
-    content = read_toml(path)
+    return robot_of(Path(path), read_toml(Path(path)))
+
+
+def robot_of(path: Path, content: dict[str, Any]) -> Robot:
+    """The same from what a ROBOT.toml says; path: what refusals call it."""
     if "rod" not in content:
         raise InputError(f"{path}: has no [rod] table; give at least length, diameter, youngs_modulus and shear_modulus")
     as_table(str(path), content, TOP_KEYS)
@@ -110,8 +115,11 @@ def read_robot(path: str | Path) -> Robot:
     gravity = torch.tensor(as_numbers(f"{path}: rod.gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3), dtype=DTYPE)
     if bool(gravity.any()) and float(rod.mass_per_length) == 0:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
+    name = content.get("name", path.stem)
+    if not isinstance(name, str):
+        raise InputError(f"{path}: name is {name!r}; it must be a text in quotes")
     listed = content.get("tendons", [])
     if not isinstance(listed, list):
         raise InputError(f"{path}: tendons must be an array of tables, [[tendons]]")
     tendons = Tendons(tuple(_tendon(f"{path}: tendons[{i}]", t, rod.length) for i, t in enumerate(listed)))
-    return Robot(rod, tendons, gravity, str(content.get("name", path.stem)))
+    return Robot(rod, tendons, gravity, name)

@@ -1,20 +1,21 @@
 """A calibrated ROBOT.toml: the text of the old one with only the calibrated values changed; comments and order are kept.
 
 The text is edited line by line, for robots written as [rod] and [[tendons]] tables with one key per line. Whatever else TOML allows
-is recognized afterwards: the new text is read back by `read_robot` and compared, so that a file that says something else is never
+is recognized afterwards: the new text is read back by `robot_of` and compared, so that a file that says something else is never
 written.
 """
 
 import re
-import uuid
+import tomllib
 import warnings
 from pathlib import Path
 
 import torch
 
 from ..errors import InputError
+from ..files import put_text, reading
 from ..robot import Robot
-from .robot_file import read_robot
+from .robot_file import robot_of
 
 HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([\w-]+)[ \t]*\]{1,2}[ \t]*(?:#.*)?$")
 NUMBER = re.compile(r"(?<![\w.+-])[+-]?\d[\d_]*(?:\.\d[\d_]*)?(?:[eE][+-]?\d[\d_]*)?(?![\w.])")
@@ -114,31 +115,22 @@ def write_calibrated(
 ) -> None:
     """Write `source` with the calibrated values of `robot`, as a whole or not at all, once it reads back as that robot.
 
-    Errors: InputError where the text cannot be edited (no file is left) or the folder cannot be written to.
+    Errors: InputError where the text cannot be edited (the file stays as it was) or the file cannot be written.
     """
-    path = Path(path).resolve()
     # Bytes, because reading as text would turn the line ends of another system into this one's.
-    text = Path(source).read_bytes().decode("utf-8")
+    with reading(source):
+        text = Path(source).read_bytes().decode("utf-8")
     offsets = tuple(t.tension_offset for t in robot.tendons.tendons) if tension_offset else None
-    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.toml")
+    text = calibrated_text(text, float(robot.rod.mass_per_length), stiffness_factor, offsets)
+    if not _reads_as(text, robot):
+        raise InputError(f"{path}: not written; {source} must be plain tables, [rod] and [[tendons]] with one key = value per line")
+    put_text(path, text)
+
+
+def _reads_as(text: str, robot: Robot) -> bool:
     try:
-        beside.write_bytes(calibrated_text(text, float(robot.rod.mass_per_length), stiffness_factor, offsets).encode())
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the source has raised them already
-            same = _reads_as(beside, robot)
-        if not same:
-            raise InputError(
-                f"{path}: not written; {source} must be plain tables, [rod] and [[tendons]] with one key = value per line"
-            )
-        beside.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
-    finally:
-        beside.unlink(missing_ok=True)
-
-
-def _reads_as(path: Path, robot: Robot) -> bool:
-    try:
-        return _same(robot, read_robot(path))
-    except InputError:
+            return _same(robot, robot_of(Path(), tomllib.loads(text)))
+    except ValueError:  # not TOML, or not a robot (InputError)
         return False

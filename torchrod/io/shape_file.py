@@ -1,22 +1,26 @@
 """SHAPES: measured marker positions, CSV or NPZ. Every refusal is one sentence with file, place and remedy."""
 
 import csv
+import io
 import math
 import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
 
 from ..errors import InputError
+from ..files import put_text, reading
 from ..geometry import too_far, too_short
 from ..measurement import Markers
 from ..robot import Robot
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
+TIP = 1e-6  # of the length: so far beyond it, a marker is at the tip, in single precision
 
 
 @dataclass(frozen=True)
@@ -30,13 +34,15 @@ class Shapes:
 def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     """Markers from a CSV or NPZ file (docs/files.md), checked against the robot. Errors: InputError naming file and remedy."""
     path = Path(path)
-    if "\0" in str(path) or not path.is_file():
-        raise InputError(f"{path}: no such file; check the path")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
-    shapes = _read_npz(path) if path.suffix == ".npz" else _read_csv(path)
+    with reading(path):
+        if "\0" in str(path) or not path.is_file():
+            raise InputError(f"{path}: no such file; check the path")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
+        with path.open("rb") as file:
+            shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
     markers, L = shapes.markers, robot.rod.length
-    outside = (markers.s < -1e-9) | (markers.s > L * (1 + 1e-9))
+    outside = (markers.s < -1e-9) | (markers.s > L * (1 + TIP))
     if bool(outside.any()):
         hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
@@ -67,10 +73,10 @@ def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: s
         )
 
 
-def _read_npz(path: Path) -> Shapes:
+def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {key: np.asarray(file[key]) for key in file.files}
+        with np.load(file, allow_pickle=False) as arrays:
+            data = {key: np.asarray(arrays[key]) for key in arrays.files}
     except (ValueError, TypeError, AttributeError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: is not an NPZ of plain numbers ({reason}); save numeric arrays only") from None
@@ -85,6 +91,8 @@ def _read_npz(path: Path) -> Shapes:
             raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
     data = {key: value.astype(np.float64) for key, value in data.items()}
     P, B = data["s"].size, len(data["positions"]) if data["positions"].ndim else 0
+    if not P or not data["positions"].size:
+        raise InputError(f"{path}: holds no marker; give at least one in s (P,) and one sample of it in positions (B, P, 3)")
     shapes = {
         "s": (P,),
         "positions": (B, P, 3),
@@ -104,11 +112,10 @@ def _read_npz(path: Path) -> Shapes:
     return Shapes(markers, [str(i) for i in range(B)])
 
 
-def _read_csv(path: Path) -> Shapes:
+def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            numbered = [(reader.line_num, row) for row in reader if row]
+        reader = csv.reader(io.TextIOWrapper(file, newline="", encoding="utf-8-sig"))
+        numbered = [(reader.line_num, row) for row in reader if row]
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: is not a CSV text file; expected the header s,x,y,z") from None
     header = [name.strip() for name in numbered[0][1]] if numbered else []
@@ -179,15 +186,16 @@ def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, f
 
 
 def write_shapes(path: str | Path, shapes: Shapes) -> None:
-    """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells."""
+    """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells. Errors: InputError."""
     markers = shapes.markers
     tensions = [] if markers.tension is None else [f"tension_{i + 1}" for i in range(markers.tension.shape[-1])]
     header = ["sample", *REQUIRED, *([] if markers.offsets is None else OFFSETS), *tensions]
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for b, name in enumerate(shapes.samples):
-            for i, s in enumerate(markers.s.tolist()):
-                position = ["" if math.isnan(v) else v for v in markers.positions[b, i].tolist()]
-                offset = [] if markers.offsets is None else markers.offsets[i].tolist()
-                writer.writerow([name, s, *position, *offset, *([] if markers.tension is None else markers.tension[b].tolist())])
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(header)
+    for b, name in enumerate(shapes.samples):
+        for i, s in enumerate(markers.s.tolist()):
+            position = ["" if math.isnan(v) else v for v in markers.positions[b, i].tolist()]
+            offset = [] if markers.offsets is None else markers.offsets[i].tolist()
+            writer.writerow([name, s, *position, *offset, *([] if markers.tension is None else markers.tension[b].tolist())])
+    put_text(path, text.getvalue())

@@ -10,10 +10,8 @@ share a file but the manifest, which is the same whoever writes it. Every refusa
 
 import hashlib
 import json
-import uuid
 import zipfile
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -26,9 +24,11 @@ from torch import Tensor
 
 from ..dataset import ARRAYS, SCHEMA, DatasetSpec, digest
 from ..errors import InputError
+from ..files import put, writing
 from ..robot import Robot
 from ..rod import Rod
 from ..tendons import Tendon, Tendons
+from .json_file import put_json
 
 MANIFEST = "manifest.json"
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
@@ -62,23 +62,6 @@ def shard_path(folder: Path, index: int, suffix: str = ".npz") -> Path:
     return folder / f"shard-{index:05d}{suffix}"
 
 
-def _put(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write a file as a whole: beside its place, then moved there."""
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    try:
-        with beside.open("xb") as file:
-            write(file)
-        beside.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); check the folder and the space on its disk") from None
-    finally:
-        beside.unlink(missing_ok=True)
-
-
-def _put_json(path: Path, content: dict[str, Any]) -> None:
-    _put(path, lambda file: file.write((json.dumps(content, indent=1) + "\n").encode()))
-
-
 def _write_npz(file: IO[bytes], arrays: dict[str, np.ndarray]) -> None:
     """As numpy.savez, but without the time of day and the system in it."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -104,15 +87,11 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
-    """Make the folder, or see that what it holds belongs to this specification. Errors: InputError otherwise."""
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: is a file; give a folder")
-    if not folder.resolve().parent.is_dir():
-        raise InputError(f"{folder}: the folder around it does not exist; create it first")
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from None
+    """Make the folder and those around it, or see that it holds shards of this specification. Errors: InputError otherwise."""
+    with writing(folder):
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: is a file; give a folder")
+        folder.mkdir(parents=True, exist_ok=True)
     for path in (folder / MANIFEST, *sorted(folder.glob("shard-*.json"))):
         content = _read_json(path)
         if content is not None and content.get("spec_sha256") != spec.sha256():
@@ -123,7 +102,7 @@ def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
 
 def write_shard(folder: Path, spec: DatasetSpec, index: int, arrays: dict[str, np.ndarray]) -> None:
     """A shard and, once it is there, its sidecar."""
-    _put(shard_path(folder, index), lambda file: _write_npz(file, arrays))
+    put(shard_path(folder, index), lambda file: _write_npz(file, arrays))
     record = {
         "schema": SCHEMA,
         "torchrod": version("torchrod"),
@@ -134,7 +113,7 @@ def write_shard(folder: Path, spec: DatasetSpec, index: int, arrays: dict[str, n
         "rejected": int(arrays["rejected"]),
         "sha256": digest(arrays),
     }
-    _put_json(shard_path(folder, index, ".json"), record)
+    put_json(shard_path(folder, index, ".json"), record)
 
 
 def has_shard(folder: Path, spec: DatasetSpec, index: int) -> bool:
@@ -166,7 +145,7 @@ def write_manifest(folder: Path, spec: DatasetSpec) -> str | None:
         "arrays": {name: dict(zip(("shape", "unit", "meaning"), row, strict=True)) for name, row in ARRAYS.items()},
         "shards": [{key: r[key] for key in keys} for r in shards],
     }
-    _put_json(folder / MANIFEST, content)
+    put_json(folder / MANIFEST, content)
     return content["digest"]
 
 

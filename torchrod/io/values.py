@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..files import reading
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
-    except ValueError as error:  # not TOML, not UTF-8, or a path that is none
-        raise InputError(f"{path}: is not valid TOML ({error})") from None
+    """The content of a TOML file. Errors: InputError."""
+    with reading(path):
+        try:
+            return tomllib.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:  # not TOML, not UTF-8, or a path that is none
+            raise InputError(f"{path}: is not valid TOML ({error}); correct that place (docs/files.md has the keys)") from None
 
 
 def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:

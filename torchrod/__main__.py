@@ -1,0 +1,7 @@
+"""python -m torchrod: the command line."""
+
+import sys
+
+from .cli import main
+
+sys.exit(main())

@@ -1,0 +1,12 @@
+"""JSON as all files of torchrod have it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from ..files import put_text
+
+
+def put_json(path: str | Path, content: dict[str, Any]) -> None:
+    """Write a table as JSON, as a whole or not at all. Errors: InputError where the file cannot be written."""
+    put_text(path, json.dumps(content, indent=1) + "\n")
