@@ -92,6 +92,25 @@ def test_a_name_with_a_dollar_is_drawn(tmp_path, monkeypatch):
     draw_observability("o.svg", [Layout(name, s, bounds(robot, s, 1e-3, 1.0))] * 2, 0.4, name)
 
 
+def test_a_result_is_drawn_on_its_own_robot_and_shapes_only(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("r.toml").write_text(ROD)
+    Path("other.toml").write_text(toml_of(CASES["passive-point-0"]["robot"], "other"))
+    Path("s.csv").write_text(STRAIGHT)
+    Path("fewer.csv").write_text(STRAIGHT.replace("0.1,0,0,0.1\n", ""))
+    name = read_robot("r.toml").name
+    for result in ("e.npz", "e.json"):
+        assert main(["estimate", "r.toml", "s.csv", "--steps", "10", "--out", result]) == 0
+        capsys.readouterr()
+        assert main(["plot", "other.toml", "s.csv", result, "--out", "p.png"]) == 2
+        expected = f"torchrod: {result}: is of robot {name!r}, not of 'other'; give the robot that was estimated\n"
+        assert capsys.readouterr().err == expected
+    assert main(["plot", "r.toml", "fewer.csv", "e.npz", "--out", "p.png"]) == 2
+    assert "is of 4 markers, not of 3; give the shapes" in capsys.readouterr().err
+    Path("e.json").write_text(Path("e.json").read_text().replace(f'"robot": "{name}", ', ""))
+    assert main(["plot", "other.toml", "s.csv", "e.json", "--out", "p.png"]) == 0
+
+
 def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
     """Two samples in one file: each decides for itself, and a missing marker is an empty cell."""
     pushed = CASES["passive-point-4"]
