@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,6 +21,7 @@ from torchrod.cli import main
 from torchrod.observability_figure import Layout, draw_observability
 from torchrod.placement import even_layout
 from torchrod.progress import bar
+from torchrod.table import _pairs
 
 CASES = {case["name"]: case for case in reference("shape")}
 ROD = toml_of(CASES["passive-point-0"]["robot"], "rod")
@@ -90,6 +92,45 @@ def test_a_name_with_a_dollar_is_drawn(tmp_path, monkeypatch):
     robot = read_robot("r.toml")
     s = even_layout(robot, 3)
     draw_observability("o.svg", [Layout(name, s, bounds(robot, s, 1e-3, 1.0))] * 2, 0.4, name)
+
+
+def test_a_result_is_drawn_on_its_own_robot_and_shapes_only(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("r.toml").write_text(ROD)
+    Path("other.toml").write_text(toml_of(CASES["passive-point-0"]["robot"], "other"))
+    Path("s.csv").write_text(STRAIGHT)
+    Path("fewer.csv").write_text(STRAIGHT.replace("0.1,0,0,0.1\n", ""))
+    name = read_robot("r.toml").name
+    for result in ("e.npz", "e.json"):
+        assert main(["estimate", "r.toml", "s.csv", "--steps", "10", "--out", result]) == 0
+        capsys.readouterr()
+        assert main(["plot", "other.toml", "s.csv", result, "--out", "p.png"]) == 2
+        expected = f"torchrod: {result}: is of robot {name!r}, not of 'other'; give the robot that was estimated\n"
+        assert capsys.readouterr().err == expected
+    assert main(["plot", "r.toml", "fewer.csv", "e.npz", "--out", "p.png"]) == 2
+    assert "is of 4 markers, not of 3; give the shapes" in capsys.readouterr().err
+    Path("e.json").write_text(Path("e.json").read_text().replace(f'"robot": "{name}", ', ""))
+    assert main(["plot", "other.toml", "s.csv", "e.json", "--out", "p.png"]) == 0
+
+
+def test_the_table_shows_two_digits_of_a_spread(tmp_path, capsys):
+    """Of a push of 1 mN and of one of 1 N, in columns."""
+    (tmp_path / "r.toml").write_text(ROD)
+    robot, shape = str(tmp_path / "r.toml"), str(tmp_path / "s.csv")
+    for force, pattern in (
+        ("0.001", r"1 +0\.0010\d\d \+- 0\.0000\d\d +0\.00\d{4} +-?0\.000\d{3} "),
+        ("1", r"1 +[01]\.\d{4} \+- 0\.\d{4} +[01]\.\d{4} +-?0\.\d{4} "),
+    ):
+        noise = "1e-6" if force == "0.001" else "1e-3"
+        assert main(["simulate", robot, "--point", "0.2", force, "0", "--noise", noise, "--out", shape]) == 0
+        capsys.readouterr()
+        assert main(["estimate", robot, shape, "--noise", noise, "--steps", "20"]) == 0
+        head, row = capsys.readouterr().out.splitlines()[:2]
+        assert re.search(pattern, row), row
+        assert len(head) == len(row)
+    assert _pairs([1e-9, 2e-9], [1e-11, math.nan], 4) == ["1.000e-09 +- 1.000e-11", "2.000e-09 +- nan"]
+    assert _pairs([2e-3], [math.nan], 4) == ["0.00200 +- nan"]
+    assert _pairs([0.0], [0.0], 1) == ["0.0 +- 0.0"]
 
 
 def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):

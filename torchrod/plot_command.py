@@ -17,5 +17,5 @@ def plot(options: Namespace) -> None:
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
     writable(options.out, FIGURE_SUFFIXES)
-    fit = read_fit(options.result, sample)
+    fit = read_fit(options.result, sample, robot.name, len(shapes.markers.s))
     draw(options.out, robot, fit, shapes.markers, shapes.samples.index(sample), f"{robot.name}, sample {sample}")

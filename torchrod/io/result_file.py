@@ -4,7 +4,7 @@ import json
 import math
 import zipfile
 import zlib
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import IO
 
@@ -164,10 +164,26 @@ def write_result(
     put(path, lambda file: np.savez_compressed(file, **content))  # pyright: ignore[reportArgumentType]
 
 
-def _index(path: Path, names: list[str], sample: str) -> int:
-    if sample not in names:
-        raise InputError(f"{path}: has no sample {sample}; choose one of those estimated with --sample")
-    return names.index(sample)
+@dataclass(frozen=True)
+class _Asked:
+    """Which fit of which file, and what it has to be of where that is known: the robot's name, the number of markers."""
+
+    path: Path
+    sample: str
+    robot: str | None
+    markers: int | None
+
+    def index(self, names: list[str]) -> int:
+        if self.sample not in names:
+            raise InputError(f"{self.path}: has no sample {self.sample}; choose one of those estimated with --sample")
+        return names.index(self.sample)
+
+    def check(self, robot: object, markers: int | None) -> None:
+        """Refuse a result of another robot or of other shapes; None in the file goes through."""
+        if None not in (robot, self.robot) and robot != self.robot:
+            raise InputError(f"{self.path}: is of robot {robot!r}, not of {self.robot!r}; give the robot that was estimated")
+        if None not in (markers, self.markers) and markers != self.markers:
+            raise InputError(f"{self.path}: is of {markers} markers, not of {self.markers}; give the shapes that were estimated")
 
 
 def _there(values: list[float | None]) -> list[float | None] | None:
@@ -175,10 +191,11 @@ def _there(values: list[float | None]) -> list[float | None] | None:
     return None if all(v is None or math.isnan(v) for v in values) else values
 
 
-def _arrays_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object], list[object] | None]:
+def _arrays_of(asked: _Asked, opened: IO[bytes]) -> tuple[list[object], list[object] | None]:
     """What a figure needs of a RESULT.npz: force, location, width, base wrench, registration, tip force, intervals; the profile."""
     with np.load(opened, allow_pickle=False) as file:
-        b = _index(path, [str(n) for n in file["sample"]], sample)
+        asked.check(str(file["robot"]) if "robot" in file else None, file["outlier"].shape[1] if "outlier" in file else None)
+        b = asked.index([str(n) for n in file["sample"]])
         values: list[object] = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
         values.append(file["registration"][b] if "registration" in file else None)
         values.append(_there(file["tip"][b][:3].tolist()) if "tip" in file else None)
@@ -188,10 +205,12 @@ def _arrays_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object]
         return values, [file["profile_s"], file["profile_f"][b], file["profile_band"][b]]
 
 
-def _record_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object], list[object] | None]:
+def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[list[object], list[object] | None]:
     """The same of a RESULT.json."""
-    results = json.load(opened)["results"]
-    record = results[_index(path, [str(r["sample"]) for r in results], sample)]
+    content = json.load(opened)
+    results = content["results"]
+    asked.check(content.get("robot"), None)
+    record = results[asked.index([str(r["sample"]) for r in results])]
     loads, wrench = record["loads"], record["base_wrench"]
     values: list[object] = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
     values.append([*wrench["force_N"], *wrench["moment_Nm"]])
@@ -206,19 +225,23 @@ def _record_of(path: Path, opened: IO[bytes], sample: str) -> tuple[list[object]
     return values, [profile["s_m"], profile["f_local_N_per_m"], band]
 
 
-def read_fit(path: str | Path, sample: str) -> Fit:
-    """One sample of a RESULT.json or RESULT.npz. Errors: InputError naming file, sample and remedy."""
+def read_fit(path: str | Path, sample: str, robot: str | None = None, markers: int | None = None) -> Fit:
+    """One sample of a RESULT.json or RESULT.npz.
+
+    robot, markers: the robot's name and the number of markers; a file that says otherwise is refused.
+    Errors: InputError naming file, sample and remedy.
+    """
     path = Path(path)
     with reading(path):
         if not path.is_file():
             raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
         with path.open("rb") as opened:
-            return _read_fit(path, opened, sample)
+            return _read_fit(_Asked(path, sample, robot, markers), opened)
 
 
-def _read_fit(path: Path, opened: IO[bytes], sample: str) -> Fit:
+def _read_fit(asked: _Asked, opened: IO[bytes]) -> Fit:
     try:
-        values, stored = (_arrays_of if path.suffix == ".npz" else _record_of)(path, opened, sample)
+        values, stored = (_arrays_of if asked.path.suffix == ".npz" else _record_of)(asked, opened)
         *loads, wrench, zeta, tip, interval = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in values]
         profile = None if stored is None else Profile(*(torch.tensor(np.array(v, dtype=float)) for v in stored))
         force, location, width = (t.reshape(-1, 2) if i == 0 else t for i, t in enumerate(loads) if t is not None)
@@ -238,8 +261,8 @@ def _read_fit(path: Path, opened: IO[bytes], sample: str) -> Fit:
         zipfile.BadZipFile,
         zlib.error,
     ) as error:
-        raise InputError(f"{path}: is not a result of torchrod estimate ({error}); write it with --out") from None
+        raise InputError(f"{asked.path}: is not a result of torchrod estimate ({error}); write it with --out") from None
     if not all(bool(torch.isfinite(t).all()) for t in [*loads, wrench, zeta, tip] if t is not None):
-        raise InputError(f"{path}: sample {sample} has no fit to draw; see its message")
+        raise InputError(f"{asked.path}: sample {asked.sample} has no fit to draw; see its message")
     assert wrench is not None
     return Fit(loads[0], loads[1], loads[2], wrench, zeta, tip, interval, profile)
