@@ -4,10 +4,12 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from tests.test_dataset import spec
 from tests.test_fast import needs_compiler
-from torchrod import fast
+from torchrod import fast, production
 
 SAID = """
 import warnings
@@ -163,3 +165,31 @@ def test_libraries_that_nobody_has_loaded_for_long_go(tmp_path):
     names = {path.name for path in cache.iterdir()}
     assert len(names) == 4
     assert {first.name, "kernel-new.so", "notes"} < names
+
+
+SHARD = """
+import torch
+from torchrod.fast import build
+build.PATIENCE = 0.0
+torch.set_default_dtype(torch.float64)
+from tests.test_dataset import spec
+from torchrod.dataset import digest, simulate_shard
+print(digest(simulate_shard(spec(samples=20), 0)))
+"""
+
+
+@needs_compiler
+def test_a_first_run_makes_the_same_shards_as_the_next(tmp_path):
+    cxx = copying(tmp_path, "sleep 2")
+    assert run(SHARD, cxx, tmp_path / "cache") == run(SHARD, cxx, tmp_path / "cache")
+
+
+def test_a_pool_of_processes_finds_the_kernel_built(tmp_path, monkeypatch):
+    """Otherwise every one of them would begin a build."""
+    events = []
+    monkeypatch.setattr(fast, "library", lambda wait=False: events.append(wait))
+    monkeypatch.setattr(production, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
+    monkeypatch.setattr(production, "simulate_shard", lambda _, index: events.append("shard"))
+    monkeypatch.setattr(production, "write_shard", lambda *_: None)
+    production.produce(spec(), tmp_path, [0, 1], 2, None, lambda _: None)
+    assert events == [True, "shard", "shard"]

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from . import fast
 from .dataset import DatasetSpec, simulate_shard
 from .errors import InputError
 from .io import write_shard
@@ -33,6 +34,8 @@ def produce(
     workers: processes on this machine; scheduler: the address of a dask cluster, tcp://host:port, to be used instead.
     Errors: InputError from the shards themselves, or where the workers are not there or have died; what is written stays.
     """
+    if scheduler is None:
+        fast.library(wait=True)  # every shard waits for it, and one build is enough for all processes
     with contextlib.ExitStack() as stack:
         if scheduler is not None:
             executor, width = stack.enter_context(_cluster(scheduler))
