@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tests.robots import steel_rod
+from tests.robots import busy_robot, steel_rod
 from tests.study import study1
 from torchrod import (
     Estimator,
@@ -87,3 +87,22 @@ def test_inference_mode(seen):
     within += [estimate(model, markers, 1e-3, start=start), follow(p[0])]
     for fit in within:
         assert torch.allclose(fit.force, whole.force[: len(fit.force)], atol=1e-4)
+
+
+def test_locations_may_be_a_list(seen):
+    robot = steel_rod()
+    given = [GaussianCoordinates(1, 0.4, robot.rod.force_scale, locations=at) for at in ([0.2], (0.2,))]
+    fits = [estimate(Model(robot, coordinates), Markers(*seen), 1e-3) for coordinates in given]  # pyright: ignore[reportArgumentType]
+    assert torch.equal(fits[0].force, fits[1].force)
+
+
+@pytest.mark.parametrize("tendons", [False, True])
+def test_no_samples_at_all(tendons):
+    robot = busy_robot() if tendons else steel_rod()
+    model = one_contact(robot)
+    s = torch.linspace(0.02, 0.2, 10)
+    markers = Markers(s, torch.zeros(0, 10, 3), tension=torch.zeros(0, len(robot.tendons)) if tendons else None)
+    x = torch.zeros(0, model.size)
+    assert model.h(x, markers).shape == (0, 36)
+    with pytest.raises(ValueError, match="at least one sample"):
+        estimate(model, markers, 1e-3)

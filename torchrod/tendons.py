@@ -88,7 +88,8 @@ class Tendons:
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
         """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""
         reach = max(max(x * x + y * y for _, x, y in t.routing) for t in self.tendons)
-        pull = tension.detach().nan_to_num(0.0).sum(-1).max()
+        pulls = tension.detach().nan_to_num(0.0).sum(-1)
+        pull = pulls.max() if pulls.numel() else pulls.new_zeros(())
         ratio = pull / K_se.diagonal(dim1=-2, dim2=-1).min() + pull * reach / K_bt.diagonal(dim1=-2, dim2=-1).min()
         return NEWTON_STEPS if bool(ratio < SOFT) else NEWTON_STEPS_SOFT
 

@@ -33,6 +33,10 @@ class GaussianCoordinates:
     locations: tuple[float, ...] | None = None
     force_std: float = WEAK_STD
 
+    def __post_init__(self):
+        if self.locations is not None:  # what is kept from call to call is kept by a hash, which a list has not
+            object.__setattr__(self, "locations", tuple(self.locations))
+
     @property
     def per_load(self) -> int:
         """Entries per load: 4, or 3 where the location is known."""

@@ -26,6 +26,10 @@ class PointCoordinates:
     force_std: float = WEAK_STD
     informative_priors: int = 0
 
+    def __post_init__(self):
+        if self.locations is not None:  # what is kept from call to call is kept by a hash, which a list has not
+            object.__setattr__(self, "locations", tuple(self.locations))
+
     @property
     def per_load(self) -> int:
         """Entries per load: 3, or 2 where the location is known."""
