@@ -1,6 +1,7 @@
-"""The compiled kernel: built on first use (build), and what it computes: the march (marching) and the fit (fitting)."""
+"""The compiled kernel: built on first use (build), and what it computes: the march (marching), the fit (fitting, derivatives)."""
 
 from .build import available, library
+from .derivatives import measured
 from .filtering import Iteration, iterate_all
 from .fitting import (
     FAMILIES,
@@ -10,7 +11,6 @@ from .fitting import (
     cost_now,
     measure,
     measure_now,
-    measured,
     normal_equations,
     normal_equations_now,
     seconds,

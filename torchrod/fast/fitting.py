@@ -1,8 +1,7 @@
 """The fit by the compiled kernel, as operators of torch: h and H, the normal equations, and one iteration of the filter.
 
-The operators are known to torch (torch.library) with a shape-only stand-in each, so torch.compile and exporting go through them;
-torchrod::measure has a derivative, dh = H dx, and a batching rule, so that gradients and every transform of torch.func go
-through it: `measured`.
+The operators are known to torch (torch.library) with a shape-only stand-in each, so torch.compile and exporting go through them.
+Their derivatives and batching rules: derivatives.py.
 """
 
 import ctypes
@@ -118,53 +117,6 @@ def measure(
 def _(x, index, slopes, tensors, counts, numbers):
     b, n, P = x.shape[0], x.shape[1], _outputs(counts)
     return x.new_empty(b, 3 * P + 6), x.new_empty(b, 3 * P + 6, n if slopes else 0), x.new_empty(b, P, 3)
-
-
-@measure.register_vmap
-def _(info, in_dims, x, index, slopes, tensors, counts, numbers):
-    """The batch of batches is one batch; what is known along the rod does not differ between them."""
-    many = info.batch_size
-    x = x.movedim(in_dims[0], 0) if in_dims[0] is not None else x.expand(many, *x.shape)
-    index = index.movedim(in_dims[1], 0) if in_dims[1] is not None else index.expand(many, *index.shape)
-    out = measure(x.flatten(0, 1), index.flatten(), slopes, tensors, counts, numbers)
-    return tuple(o.unflatten(0, x.shape[:2]) for o in out), (0, 0, 0)
-
-
-class _Measured(torch.autograd.Function):
-    """h(x) with dh = H dx, in both modes."""
-
-    @staticmethod
-    def forward(x, index, tensors, counts, numbers):  # pyright: ignore[reportIncompatibleMethodOverride]
-        h, H, _ = measure(x, index, True, tensors, counts, numbers)
-        return h, H
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.mark_non_differentiable(output[1])
-        ctx.save_for_backward(output[1])
-        ctx.save_for_forward(output[1])
-
-    @staticmethod
-    def backward(ctx, dh, _):  # pyright: ignore[reportIncompatibleMethodOverride]
-        (H,) = ctx.saved_tensors
-        return (H * dh.unsqueeze(-1)).sum(-2), None, None, None, None
-
-    @staticmethod
-    def jvp(ctx, dx, *_):  # pyright: ignore[reportIncompatibleMethodOverride]
-        (H,) = ctx.saved_tensors
-        return (H * dx.unsqueeze(-2)).sum(-1), None
-
-    @staticmethod
-    def vmap(info, in_dims, x, index, tensors, counts, numbers):  # pyright: ignore[reportIncompatibleMethodOverride]
-        x = x.movedim(in_dims[0], 0) if in_dims[0] is not None else x.expand(info.batch_size, *x.shape)
-        index = index.expand(info.batch_size, *index.shape) if in_dims[1] is None else index.movedim(in_dims[1], 0)
-        h, H = _Measured.apply(x.flatten(0, 1), index.flatten(), tensors, counts, numbers)  # pyright: ignore[reportGeneralTypeIssues]
-        return (h.unflatten(0, x.shape[:2]), H.unflatten(0, x.shape[:2])), (0, 0)
-
-
-def measured(x: Float[Tensor, "b n"], index: Int[Tensor, " b"], tables: FitTables) -> Float[Tensor, "b z"]:
-    """h(x) of the samples `index`, once differentiable in x by autograd and by every transform of torch.func."""
-    return _Measured.apply(x, index, tables.tensors, tables.counts, tables.numbers)[0]  # pyright: ignore[reportOptionalSubscript]
 
 
 def normal_equations_now(x: Tensor, fit: Fit, P: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
