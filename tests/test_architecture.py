@@ -104,3 +104,17 @@ print(fit.magnitude_std, fit.rms_residual, fit.fit(0).loads(0.4))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_nothing_is_said_twice():
+    """No function with the same name and body, and no tuple of the same name and values, in two modules."""
+    seen = {}
+    for path in MODULES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef):
+                what = node.name, ast.dump(node.args), *map(ast.dump, node.body[ast.get_docstring(node) is not None :])
+            elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):
+                what = (ast.dump(node),)
+            else:
+                continue
+            assert seen.setdefault(what, path) == path, f"{ast.unparse(node)[:60]}: in {seen[what].name} and {path.name}"

@@ -8,7 +8,7 @@ import torch
 from jsonargparse import Namespace
 from torch import Tensor
 
-from .arguments import noise_std, positive, writable
+from .arguments import FIGURE_SUFFIXES, noise_std, positive, writable
 from .errors import InputError
 from .io import read_robot, write_observability, write_observability_table
 from .observability import BENDS, LOCALIZED, Observability, bounds
@@ -16,7 +16,6 @@ from .placement import Placement, even_layout, place
 from .robot import Robot
 from .rod import DTYPE
 
-FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 DEFAULT_MARKERS = 20
 MOST_MARKERS = 200
 ROWS = 10  # of the table on the screen

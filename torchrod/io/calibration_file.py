@@ -1,11 +1,10 @@
 """CALIBRATION.json: what torchrod calibrate found (docs/files.md)."""
 
-import math
 from pathlib import Path
 
 from ..calibration import Calibration
 from ..unloaded import MASS, OFFSET
-from .json_file import put_json
+from .json_file import plain, put_json
 
 CALIBRATION_SUFFIXES = (".json",)
 
@@ -13,11 +12,6 @@ CALIBRATION_SUFFIXES = (".json",)
 def unit_of(name: str) -> str:
     """The unit of a calibrated parameter: kg/m, N, or 1 for a factor."""
     return "kg/m" if name == MASS else "N" if name.startswith(OFFSET) else "1"
-
-
-def _plain(value: float) -> float | None:
-    """JSON has no NaN: an unknown number is null."""
-    return value if math.isfinite(value) else None
 
 
 def write_calibration(path: str | Path, calibration: Calibration, samples: list[str], robot: str, noise: float) -> None:
@@ -29,9 +23,9 @@ def write_calibration(path: str | Path, calibration: Calibration, samples: list[
         "accepted": c.accepted,
         "message": c.message,
         "iterations": c.iterations,
-        "chi2": _plain(c.chi2),
+        "chi2": plain(c.chi2),
         "dof": c.dof,
-        "rms_residual_m": _plain(c.rms_residual),
+        "rms_residual_m": plain(c.rms_residual),
         "noise_m": noise,
         "std_from": "residuals" if c.rescaled else "noise",
         "samples": [name for name, used in zip(samples, c.used.tolist(), strict=True) if used],
@@ -40,11 +34,11 @@ def write_calibration(path: str | Path, calibration: Calibration, samples: list[
             {
                 "name": name,
                 "unit": unit_of(name),
-                "before": _plain(float(c.before[i])),
-                "after": _plain(float(c.values[i])),
-                "std": _plain(float(c.std[i])),
-                "std_noise": _plain(float(c.std_noise[i])),
-                "interval_95": [_plain(v) for v in c.interval_95[i].tolist()],
+                "before": plain(float(c.before[i])),
+                "after": plain(float(c.values[i])),
+                "std": plain(float(c.std[i])),
+                "std_noise": plain(float(c.std_noise[i])),
+                "interval_95": [plain(v) for v in c.interval_95[i].tolist()],
                 "determined": name not in c.undetermined,
             }
             for i, name in enumerate(c.names)

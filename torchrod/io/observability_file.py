@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 from pathlib import Path
 
 from torch import Tensor
@@ -10,12 +9,7 @@ from torch import Tensor
 from ..files import put_text
 from ..observability import FALSE_ALARM, LOCALIZED, POWER, Observability
 from ..placement import Placement
-from .json_file import put_json
-
-
-def _plain(value: float) -> float | None:
-    """JSON has no NaN and no infinity: what markers do not show is null."""
-    return value if math.isfinite(value) else None
+from .json_file import plain, put_json
 
 
 def _columns(seen: Observability) -> dict[str, Tensor]:
@@ -65,7 +59,7 @@ def write_observability(
         "power": POWER,
         "localized_share": LOCALIZED,
         "places": [
-            {name: _plain(value) for name, value in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)
+            {name: plain(value) for name, value in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)
         ],
         "placement": None
         if placed is None
@@ -73,8 +67,8 @@ def write_observability(
             "from_m": placed.nearest,
             "even_m": placed.even.tolist(),
             "proposed_m": placed.s.tolist(),
-            "worst_location_std_even_m": _plain(placed.worst_even),
-            "worst_location_std_m": _plain(placed.worst),
+            "worst_location_std_even_m": plain(placed.worst_even),
+            "worst_location_std_m": plain(placed.worst),
         },
     }
     put_json(path, content)

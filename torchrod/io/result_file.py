@@ -20,13 +20,9 @@ from ..noise import Noise
 from ..profile import Profile
 from ..result import Estimate
 from ..status import Status
+from .json_file import plain
 
 RESULT_SUFFIXES = (".json", ".npz")
-
-
-def _plain(value: float) -> float | None:
-    """JSON has no NaN: an unknown number is null."""
-    return value if math.isfinite(value) else None
 
 
 def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
@@ -34,19 +30,19 @@ def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
     pair = estimate.magnitude_location_covariance[b]
     return [
         {
-            "force_local_N": [_plain(v) for v in force[k]],
-            "magnitude_N": _plain(float(estimate.magnitude[b, k])),
-            "location_m": _plain(float(estimate.location[b, k])),
-            "width_m": _plain(float(estimate.width[b, k])),
-            "net_force_local_N": [_plain(v) for v in net[k]],
-            "covariance": [[_plain(v) for v in row] for row in pair[k].tolist()],
+            "force_local_N": [plain(v) for v in force[k]],
+            "magnitude_N": plain(float(estimate.magnitude[b, k])),
+            "location_m": plain(float(estimate.location[b, k])),
+            "width_m": plain(float(estimate.width[b, k])),
+            "net_force_local_N": [plain(v) for v in net[k]],
+            "covariance": [[plain(v) for v in row] for row in pair[k].tolist()],
             "std": {
-                "magnitude_N": _plain(float(estimate.magnitude_std[b, k])),
-                "location_m": _plain(float(estimate.location_std[b, k])),
+                "magnitude_N": plain(float(estimate.magnitude_std[b, k])),
+                "location_m": plain(float(estimate.location_std[b, k])),
             },
             "interval_95": {
-                "magnitude_N": [_plain(v) for v in estimate.magnitude_interval[b, k].tolist()],
-                "location_m": [_plain(v) for v in estimate.location_interval[b, k].tolist()],
+                "magnitude_N": [plain(v) for v in estimate.magnitude_interval[b, k].tolist()],
+                "location_m": [plain(v) for v in estimate.location_interval[b, k].tolist()],
             },
         }
         for k in range(len(force))
@@ -56,7 +52,7 @@ def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
 
 def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
     """One sample's entry of RESULT.json."""
-    wrench = [_plain(v) for v in estimate.base_wrench[b].tolist()]
+    wrench = [plain(v) for v in estimate.base_wrench[b].tolist()]
     record: dict[str, object] = {
         "sample": int(sample)
         if sample.isascii() and sample.isdecimal() and len(sample) < 16 and str(int(sample)) == sample
@@ -67,21 +63,21 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
         "iterations": int(estimate.iterations[b]),
         "restarts": int(estimate.restarts[b]),
         "warm_started": bool(estimate.warm_started[b]),
-        "chi2": _plain(float(estimate.chi2[b])),
+        "chi2": plain(float(estimate.chi2[b])),
         "dof": int(estimate.dof[b]),
-        "rms_residual_m": _plain(float(estimate.rms_residual[b])),
+        "rms_residual_m": plain(float(estimate.rms_residual[b])),
         "loads": _loads(estimate, b),
         "base_wrench": {"force_N": wrench[:3], "moment_Nm": wrench[3:]},
     }
     if estimate.tip is not None and estimate.tip_covariance is not None:
-        tip = [_plain(v) for v in estimate.tip[b].tolist()]
-        std = [_plain(v) for v in estimate.tip_covariance[b].diagonal().clamp(min=0).sqrt().tolist()]
+        tip = [plain(v) for v in estimate.tip[b].tolist()]
+        std = [plain(v) for v in estimate.tip_covariance[b].diagonal().clamp(min=0).sqrt().tolist()]
         record["tip"] = {"force_N": tip[:3], "moment_Nm": tip[3:], "std": {"force_N": std[:3], "moment_Nm": std[3:]}}
     if estimate.registration is not None:
-        twist = [_plain(v) for v in estimate.registration[b].tolist()]
+        twist = [plain(v) for v in estimate.registration[b].tolist()]
         record["registration"] = {"translation_m": twist[:3], "rotation_rad": twist[3:]}
     if estimate.tension is not None and estimate.tension_std is not None:
-        values, stds = ([_plain(v) for v in x[b].tolist()] for x in (estimate.tension, estimate.tension_std))
+        values, stds = ([plain(v) for v in x[b].tolist()] for x in (estimate.tension, estimate.tension_std))
         record["tensions"] = {"tension_N": values, "std": {"tension_N": stds}}
     if bool(estimate.outlier[b].any()):
         record["outliers"] = [i + 1 for i in estimate.outlier[b].nonzero().flatten().tolist()]
@@ -110,9 +106,9 @@ def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
     rows = list(zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True))
     return {
         "chosen": evidence.names[int(evidence.choice[b])],
-        "bic": {name: _plain(value) for name, value, _ in rows},
+        "bic": {name: plain(value) for name, value, _ in rows},
         "not_converged": [name for name, value, _ in rows if math.isinf(value)],
-        "bic_foreseen": {name: _plain(promised) for name, value, promised in rows if math.isnan(value)},
+        "bic_foreseen": {name: plain(promised) for name, value, promised in rows if math.isnan(value)},
     }
 
 
@@ -143,7 +139,7 @@ def write_result(
             record["suspect_markers"] = diagnosis.suspects(b)  # pyright: ignore[reportOptionalMemberAccess]
             record["message"] = f"{record['message']} {diagnosis.message(b)}".rstrip()  # pyright: ignore[reportOptionalMemberAccess]
         for b, record in enumerate(records if noise is not None else ()):
-            record["noise"] = {"noise_m": _plain(float(noise.sigma[b])), "std_m": _plain(float(noise.std[b]))}  # pyright: ignore[reportOptionalMemberAccess]
+            record["noise"] = {"noise_m": plain(float(noise.sigma[b])), "std_m": plain(float(noise.std[b]))}  # pyright: ignore[reportOptionalMemberAccess]
         texts = [json.dumps(record, indent=1) for record in records]
         if profile is not None:
             texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
