@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.many_fits
 ROOT = Path(__file__).resolve().parents[1]
 CASES = ("study1_1mm", "nitinol", "one_tendon", "reference")
 STARTS = {"cold", "warm", "oracle"}

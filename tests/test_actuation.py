@@ -32,6 +32,7 @@ def test_constant_curvature():
     assert abs(float(answer.path[0, 0]) - 0.395) < 1e-9
 
 
+@pytest.mark.many_fits
 def test_what_was_pulled_is_what_the_tension_gives():
     """Every sample has its own load; the solved tensions, put into the forward solve, give the same shape and path."""
     robot = Robot(busy_robot().rod, busy_robot().tendons, T([9.81, 0.0, 0.0]))
@@ -47,6 +48,7 @@ def test_what_was_pulled_is_what_the_tension_gives():
     assert (answer.tension[answer.slack] == 0).all()
 
 
+@pytest.mark.many_fits
 def test_a_sample_does_not_depend_on_its_batch():
     robot, d = one_tendon(), T([[2e-3], [11e-3], [torch.nan], [-1e-3]])
     together = solve_displacement(robot, (), d, S)

@@ -56,6 +56,7 @@ def write(folder: Path, samples: dict[str, list[list]]) -> list[str]:
 
 
 @pytest.mark.parametrize("contacts", ["1", "auto"])
+@pytest.mark.many_fits
 def test_a_sequence_of_wrong_samples_leaves_the_good_ones_alone(tmp_path, capsys, contacts):
     samples = {"before": GOOD} | {name: rows for name, (rows, _) in WRONG.items()} | {"after": GOOD}
     out = str(tmp_path / "result.json")
@@ -107,6 +108,7 @@ def test_the_unit_is_told_however_the_rod_is_bent():
 
 
 @pytest.mark.parametrize("options", [["--contacts", "2"], ["--contacts", "auto"], ["--contacts", "auto", "--noise", "auto"]])
+@pytest.mark.many_fits
 def test_too_few_markers_are_invalid_and_the_rest_go_on(tmp_path, options):
     """No marker, and one that has been moved: no count of contacts and no noise can be told from them, auto or not."""
     one = [row if i == LAST else [row[0], "", "", ""] for i, row in enumerate(GOOD)]

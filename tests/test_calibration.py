@@ -98,6 +98,7 @@ def test_stiffness_and_offsets_are_found_where_asked(name, stiffness, offsets):
 
 @pytest.mark.parametrize("factor", [0.05, 20.0])
 @pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.many_fits
 def test_far_starts_end_at_the_same_place(name, factor):
     make, mass, tension = ROBOTS[name]
     markers = shapes_of(make(), tension)
@@ -114,6 +115,7 @@ def test_without_a_mass_to_start_from():
     assert abs(float(found.values[0]) / mass - 1) < 0.02
 
 
+@pytest.mark.many_fits
 def test_offsets_at_the_kink_of_a_slack_tendon():
     """Readings of zero and offsets near zero: the cost has a kink where the search starts, and often its minimum there."""
     make, mass, tension = ROBOTS["two tendons"]
@@ -126,6 +128,7 @@ def test_offsets_at_the_kink_of_a_slack_tendon():
         assert bool((found.values[-2:].abs() < 3 * found.std[-2:]).all())
 
 
+@pytest.mark.many_fits
 def test_the_interval_of_log_mass_covers(monkeypatch):
     """200 repeats of two shapes with three markers: 90 to 99 % of the 95 % intervals hold the truth."""
     solve, known = UnloadedShapes.seen, {}
@@ -160,6 +163,7 @@ def test_residuals_larger_than_the_noise_widen_the_standard_deviations():
     assert "state more noise" in small.message
 
 
+@pytest.mark.many_fits
 def test_missing_markers_weigh_nothing_and_lost_samples_are_named():
     make, mass, tension = ROBOTS["one tendon"]
     tension = [*tension, [1e7]]  # no equilibrium: it would crush the rod
@@ -199,6 +203,7 @@ def test_a_parameter_that_does_not_show_is_named():
     assert "hardly determine mass_per_length" in found.message
 
 
+@pytest.mark.many_fits
 def test_too_few_iterations_are_reported():
     make, mass, tension = ROBOTS["one tendon"]
     found = run(make(20 * mass), shapes_of(make(), tension), settings=Settings(max_iterations=2))
@@ -268,6 +273,7 @@ def files(folder: Path, robot: str, markers: Markers) -> tuple[str, str]:
 
 @pytest.mark.parametrize("section", [CIRCLE, MATRIX], ids=["circle", "matrix"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"], ids=["lf", "crlf"])
+@pytest.mark.many_fits
 def test_the_text_of_the_robot_file_is_kept(tmp_path, capsys, section, end):
     text = TOML.format(section=section).replace("\n", end)
     truth = two_tendons(offsets=OFFSETS)
@@ -312,6 +318,7 @@ def test_text_that_cannot_be_edited_leaves_no_file(tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["robot.toml", "shapes.csv"]
 
 
+@pytest.mark.many_fits
 def test_a_calibrated_robot_estimates_better(tmp_path):
     """By the command line: mass and offsets from unloaded shapes, then the load on a loaded one."""
     truth, load = two_tendons(offsets=OFFSETS), PointForces(T([[[0.6, -0.3, 0.0]]]), T([[0.4]]))

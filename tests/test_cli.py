@@ -149,6 +149,7 @@ def test_auto_finds_no_load_on_a_straight_rod_and_one_on_a_pushed_one(tmp_path):
     assert bent["accepted"]
 
 
+@pytest.mark.many_fits
 def test_the_hypothesis_of_an_npz_has_a_name(tmp_path):
     (tmp_path / "r.toml").write_text(ROD)
     (tmp_path / "s.csv").write_text(csv_of(CASES["passive-point-4"]))

@@ -65,6 +65,7 @@ def test_the_cost_of_every_exchange_is_that_of_making_it():
         assert torch.allclose((z[:, order] - fitted).square().sum(-1).nansum(-1), beside[:, i, j])
 
 
+@pytest.mark.many_fits
 def test_exchanged_labels_are_found_and_nothing_else():
     """Neighbours 2 cm apart and far ones; the clean samples in between stay unsuspected, and the fit is not touched."""
     pairs = [(6, 7), (0, 0), (2, 15), (18, 19), (5, 5), (0, 1), (3, 9), (10, 11)]
@@ -79,6 +80,7 @@ def test_exchanged_labels_are_found_and_nothing_else():
     assert fit.residual[0].abs().max() > 5e-3, "the fit is that of the markers as they are labelled"
 
 
+@pytest.mark.many_fits
 def test_three_labels_in_a_ring_are_one_group():
     markers = noisy(1)
     positions = markers.positions.clone()
@@ -91,6 +93,7 @@ def test_three_labels_in_a_ring_are_one_group():
     assert "5, 10 and 13" in diagnosis.message(0)
 
 
+@pytest.mark.many_fits
 def test_a_base_frame_that_is_off_is_told_with_its_size():
     clean = noisy(6)
     markers = Markers(clean.s, off(clean.positions))
@@ -107,6 +110,7 @@ def test_a_base_frame_that_is_off_is_told_with_its_size():
     assert [unhurt.message(b) for b in range(6)] == [""] * 6
 
 
+@pytest.mark.many_fits
 def test_a_load_too_few_is_no_base_frame():
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     push = PointForces(T([[[0.8, 0.2, 0.0], [-0.6, 0.7, 0.0]]]), T([[0.15, 0.32]]))
@@ -118,6 +122,7 @@ def test_a_load_too_few_is_no_base_frame():
     assert diagnosis.registration.isnan().all()
 
 
+@pytest.mark.many_fits
 def test_the_command_line_tells(tmp_path, capsys):
     """In the report and in RESULT.json, with one contact and with auto, and the samples beside them are as without."""
     (tmp_path / "robot.toml").write_text(ROD)
@@ -143,6 +148,7 @@ def test_the_command_line_tells(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.many_fits
 def test_outliers_are_named_where_nothing_else_explains_the_markers(count):
     """2 of 20 markers 50 mm off, in every other sample: those two are told, and none of clean markers."""
     markers = noisy(8)

@@ -59,6 +59,7 @@ def errors(fit, size, at) -> tuple[float, float]:
     return float((fit.magnitude[:, 0] - size).square().mean().sqrt()), float((fit.location[:, 0] - at).square().mean().sqrt())
 
 
+@pytest.mark.many_fits
 def test_outliers_are_named_and_cost_little():
     """The issue's bar: with 10 % of the markers off by 50 mm, errors within 1.5 of clean."""
     p, size, at = drawn()
@@ -75,6 +76,7 @@ def test_outliers_are_named_and_cost_little():
     assert not clean.outlier.any()
 
 
+@pytest.mark.many_fits
 def test_a_fit_that_leaves_most_markers_aside_is_not_accepted():
     p, _, _ = drawn()
     scattered = p[:20] + 0.05 * torch.randn(20, 20, 3, generator=torch.Generator().manual_seed(1))
@@ -82,6 +84,7 @@ def test_a_fit_that_leaves_most_markers_aside_is_not_accepted():
     assert not fit.accepted.any()
 
 
+@pytest.mark.many_fits
 def test_the_noise_is_found_and_what_it_costs_is_counted():
     for sigma in (2e-4, 4e-3):
         p, size, _ = drawn(sigma)
@@ -97,6 +100,7 @@ def test_the_noise_is_found_and_what_it_costs_is_counted():
         assert 0.88 < float(inside) < 0.99
 
 
+@pytest.mark.many_fits
 def test_the_noise_is_found_without_knowing_the_number_of_loads():
     """The richest fit does not settle in 3 % of these cases (9 % without a load): alone its noise is up to 14 times too large."""
     robot, g = steel_rod(), torch.Generator().manual_seed(7)
@@ -115,6 +119,7 @@ def test_the_noise_is_found_without_knowing_the_number_of_loads():
         assert torch.equal(known.sigma, noise.sigma)
 
 
+@pytest.mark.many_fits
 def test_outliers_of_a_model_with_too_few_loads_do_not_tell_the_noise():
     """A robust fit without a load calls most markers outliers; what those leave is little, and no noise."""
     p = drawn()[0][:20]
@@ -125,6 +130,7 @@ def test_outliers_of_a_model_with_too_few_loads_do_not_tell_the_noise():
     assert 0.9 < (noise.sigma / 1e-3).mean() < 1.1 and noise.sigma.max() < 1.5e-3
 
 
+@pytest.mark.many_fits
 def test_the_noise_of_a_sample_does_not_depend_on_its_batch():
     """Rounds go on for the sake of others; a sample that has settled stays."""
     p = drawn()[0][:8]
@@ -134,6 +140,7 @@ def test_the_noise_of_a_sample_does_not_depend_on_its_batch():
     assert torch.allclose(together.sigma, torch.cat([one.sigma for one in alone]), rtol=1e-6)
 
 
+@pytest.mark.many_fits
 def test_few_markers_tell_the_noise_by_the_richest_model_they_can(tmp_path, capsys):
     """Three markers cannot determine three loads; one of a sample's markers tells no noise at all, and the table says so."""
     (tmp_path / "robot.toml").write_text(
@@ -150,6 +157,7 @@ def test_few_markers_tell_the_noise_by_the_richest_model_they_can(tmp_path, caps
     assert "noise not known: too few markers" in said
 
 
+@pytest.mark.many_fits
 def test_a_smooth_residual_is_not_noise():
     """Two strong pushes fitted by one leave a residual that is alike from marker to marker; noise alone does not."""
     robot, at = steel_rod(), T([[0.12, 0.36]])
@@ -165,6 +173,7 @@ def pulled() -> Robot:
     return Robot(steel_rod().rod, tendons)
 
 
+@pytest.mark.many_fits
 def test_tensions_move_within_their_sensors_errors():
     """An error of a tension passes for a force: only with the tensions in the state does the reported spread cover that."""
     robot, g = pulled(), torch.Generator().manual_seed(0)
@@ -193,6 +202,7 @@ def test_tensions_move_within_their_sensors_errors():
 
 
 @pytest.mark.parametrize("suffix", ["json", "npz"])
+@pytest.mark.many_fits
 def test_the_command_says_all_of_it(tmp_path, capsys, suffix):
     (tmp_path / "robot.toml").write_text(
         'name = "rod"\n[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n'

@@ -71,6 +71,7 @@ def test_the_interval_of_a_force_that_is_not_there_reaches_zero():
     assert fit.magnitude_interval[0, 0, 0] == 0
 
 
+@pytest.mark.many_fits
 def test_a_samples_answer_does_not_depend_on_its_batch():
     """With a NaN neighbour, one that is nonsense, and one that has too few markers."""
     study = study1(4)
@@ -120,6 +121,7 @@ def test_a_known_location_is_kept():
         assert fit.location_std[0, 0] == 0
 
 
+@pytest.mark.many_fits
 def test_registration_recovers_a_wrong_base_frame():
     """5 mm and 3 degrees off; without registration the fit is refused and says to look at registration."""
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
@@ -137,6 +139,7 @@ def test_registration_recovers_a_wrong_base_frame():
     assert "registration" in plain.message(0)
 
 
+@pytest.mark.many_fits
 def test_markers_off_the_centre_line():
     """p(s) + R(s) r: offset markers see the same load; taken for the centre line they are refused."""
     robot, s = steel_rod(), torch.linspace(0.05, 0.4, 8)
@@ -166,6 +169,7 @@ def test_the_other_families_fit_the_shape(family):
         assert torch.allclose(fit.force[0, 0], T([0.4, 0.9]), atol=0.05)
 
 
+@pytest.mark.many_fits
 def test_the_paper_mode_runs_the_plain_recursion():
     """The paper's parameters without safeguards: most of Study 1 converges, to the true load, and far more slowly."""
     study = study1()
@@ -205,6 +209,7 @@ def test_what_does_not_fit_is_refused_with_the_remedy(change, words):
         estimate(model, Markers(s, torch.zeros(1, len(s), 3), None, tension), change.get("noise", 1e-3))
 
 
+@pytest.mark.many_fits
 def test_a_strong_push_near_the_tip_is_found_by_a_restart():
     """From rest these settle at a quarter of the force; the chi-square test sees it, and other magnitudes are tried."""
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)

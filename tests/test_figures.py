@@ -34,6 +34,7 @@ def wrong(tmp_path_factory):
 
 
 @pytest.mark.parametrize("part", ["two", "three", "wrong"])
+@pytest.mark.many_fits
 def test_pictures_and_data(part, request):
     folder, data, lines = request.getfixturevalue(part)
     assert json.loads(json.dumps(data)) == data, "plain numbers"

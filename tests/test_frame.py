@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 
+import pytest
 import roma
 import torch
 
@@ -28,6 +29,7 @@ def model_of(study, registration: bool) -> Model:
     return Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale), registration)
 
 
+@pytest.mark.many_fits
 def test_many_shapes_tell_the_frame():
     """20 shapes: errors within 1.3 of those with a perfect frame, where every shape by itself has several times as much."""
     study, perfect, moved = shapes(20)
@@ -66,6 +68,7 @@ def test_the_share_of_the_frame_is_that_of_a_joint_covariance():
     assert torch.allclose(fit.magnitude_std, each.magnitude_std, rtol=0.15)
 
 
+@pytest.mark.many_fits
 def test_a_count_that_no_shape_asks_for(tmp_path, capsys):
     """`--contacts auto` of a few shapes: a model that was tried and not chosen has more unknowns than the fits that were kept."""
     moved = shapes(3)[2]
@@ -76,6 +79,7 @@ def test_a_count_that_no_shape_asks_for(tmp_path, capsys):
     assert [len(r["loads"]) for r in json.loads((tmp_path / "r.json").read_text())["results"]] == [1, 1, 1]
 
 
+@pytest.mark.many_fits
 def test_the_command_line(tmp_path, capsys):
     """One frame for 12 samples, one of them nonsense; with one contact and with auto."""
     study, _, moved = shapes(12)
@@ -101,6 +105,7 @@ def test_the_command_line(tmp_path, capsys):
     assert "give --registration as well" in capsys.readouterr().err
 
 
+@pytest.mark.many_fits
 def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
     """4 more markers at s = 0, 200 mm off the axis: within 1.7 of a perfect frame, a shape by itself."""
     study, perfect, moved = shapes(40)
@@ -118,6 +123,7 @@ def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
         assert without > 1.5 * with_plate, what
 
 
+@pytest.mark.many_fits
 def test_a_frame_that_is_known_better(tmp_path, capsys):
     """--frame-std: the prior of a registration; a frame that is known to 0.01 mm stays where it is."""
     study, _, moved = shapes(1)

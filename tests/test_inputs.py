@@ -73,6 +73,7 @@ def test_starts_and_gravity_that_do_not_fit(seen):
         estimate(tilted, markers, 1e-3)
 
 
+@pytest.mark.many_fits
 def test_inference_mode(seen):
     """Tensors made in it do not tell whether they have been changed; what is kept must serve outside of it, too."""
     s, p = seen

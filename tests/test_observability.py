@@ -47,6 +47,7 @@ def rod_seen(s=S, noise=1e-3, force=1.0, robot=None, **options):
     return bounds(robot or steel_rod(), s, noise, force, AT, directions=4, **options)
 
 
+@pytest.mark.many_fits
 def test_the_bound_is_the_scatter_of_estimates():
     """200 noisy estimates of one push."""
     robot, noise, force, at = steel_rod(), 3e-4, T([[0.6, -0.35]]), T([0.25])
@@ -100,6 +101,7 @@ def test_a_straight_rod_is_beam_theory():
     assert torch.allclose(seen.location_std, std[:, 1:].expand(-1, 4), rtol=0.02)
 
 
+@pytest.mark.many_fits
 def test_localizable_force_reaches_the_stated_share():
     """At the force that is reported, the location's standard deviation is 5 % of L; without a force nothing is located."""
     robot = steel_rod()

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from tests.conftest import reference
@@ -44,6 +45,7 @@ def drawn(count: int) -> tuple[Model, torch.Tensor, Markers]:
     return Model(robot, coordinates), gamma, Markers(S20, p + 1e-3 * torch.randn(p.shape, generator=generator))
 
 
+@pytest.mark.many_fits
 def test_the_band_holds_the_truth():
     model, gamma, markers = drawn(200)
     fit = estimate(model, markers, 1e-3)

@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
+@pytest.mark.many_fits
 def test_quick_reproduction(tmp_path):
     command = [
         sys.executable,

@@ -65,6 +65,7 @@ def run(folder, markers: Markers, *options: str) -> list[dict]:
 
 
 @pytest.mark.parametrize("contacts", [0, 1, 2])
+@pytest.mark.many_fits
 def test_the_count_is_found_and_its_evidence_told(contacts, tmp_path):
     results = run(tmp_path, markers_of(pushes(contacts), 6, 3), "--contacts", "auto")
     for sample in results:
@@ -80,6 +81,7 @@ def test_the_count_is_found_and_its_evidence_told(contacts, tmp_path):
             assert abs(load["magnitude_N"] - math.hypot(x, y)) < 0.4
 
 
+@pytest.mark.many_fits
 def test_a_push_at_the_tip_competes(tmp_path):
     tip = (PointWrenches(T([[[0.2, 0.1, -0.3]]]), T([[[0.0, 0.0, 0.0]]]), T([0.4])),)
     for sample in run(tmp_path, markers_of(tip, 3, 4), "--contacts", "auto", "--unknown-tip", "force"):
@@ -87,6 +89,7 @@ def test_a_push_at_the_tip_competes(tmp_path):
         assert abs(sample["tip"]["force_N"][0] - 0.2) < 5 * sample["tip"]["std"]["force_N"][0]
 
 
+@pytest.mark.many_fits
 def test_what_one_sample_chooses_does_not_depend_on_its_neighbours(tmp_path):
     both = torch.cat([markers_of(pushes(k), 1, 5).positions for k in (0, 2, 1)])
     together = run(tmp_path, Markers(S, both), "--contacts", "auto")
@@ -97,6 +100,7 @@ def test_what_one_sample_chooses_does_not_depend_on_its_neighbours(tmp_path):
             assert abs(one["magnitude_N"] - other["magnitude_N"]) < 1e-9
 
 
+@pytest.mark.many_fits
 def test_a_wide_load_is_told_from_a_contact(tmp_path):
     """Markers must be good for that: the width hardly shows."""
     wide = (GaussianLoads(T([[[4.0, 0.0]]]), T([[0.25]]), T([[0.5 / 0.1**2]])),)
@@ -105,6 +109,7 @@ def test_a_wide_load_is_told_from_a_contact(tmp_path):
             assert sample["evidence"]["chosen"] == f"1 {prior}"
 
 
+@pytest.mark.many_fits
 def test_a_contact_and_a_push_at_the_tip_are_told_from_two_contacts_and_a_push(tmp_path):
     """Pushes along the rod beyond its buckling load: the stages alone end at "2 + tip force" in these (docs/contacts.md)."""
     truth = contacts.Truth(1, tip=True)

@@ -11,6 +11,7 @@ FRAMES = 25
 
 
 @pytest.mark.parametrize("kind", ["passive", "tendons"])
+@pytest.mark.many_fits
 def test_frame_after_frame(kind):
     robot, s, turn = (
         (busy_robot() if kind == "tendons" else steel_rod()),

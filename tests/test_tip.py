@@ -119,6 +119,7 @@ def test_the_command_line_reports_the_tip(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("suffix", ["json", "npz"])
+@pytest.mark.many_fits
 def test_a_tip_that_the_data_do_not_ask_for_is_not_drawn(tmp_path, capsys, suffix):
     """--contacts auto with an unknown tip, of a push on the body: no tip in the table, and figures that can be drawn."""
     robot, shape, out, figure = (str(tmp_path / n) for n in ("r.toml", "s.csv", f"o.{suffix}", "f.png"))

@@ -33,6 +33,7 @@ SMALL = Recipe(1, "contacts", ("contact", "point"), (0.1, 2.0), blocks=4, block_
     ],
     ids=["one", "two", "tendons", "smooth"],
 )
+@pytest.mark.many_fits
 def test_a_block_is_a_pure_function_of_its_recipe(recipe, inputs):
     first, again, other = block(recipe, 1), block(recipe, 1), block(replace(recipe, seed=1), 1)
     n = 4 * recipe.contacts
@@ -92,6 +93,7 @@ def train(folder: Path, name: str, *options: str) -> Path:
     return folder / "out" / f"{name}.safetensors"
 
 
+@pytest.mark.many_fits
 def test_a_small_run_repeats_itself_and_resumes(tmp_path):
     threads = torch.get_num_threads()
     try:

@@ -1,9 +1,12 @@
 """The parts of scripts/trust.py run, and their figures say what the page says."""
 
+import pytest
 from matplotlib.figure import Figure
 from trusting import coverage, frame, markers, mistakes, unknown_noise
 
 from torchrod import Estimate
+
+pytestmark = pytest.mark.many_fits
 
 
 def test_coverage_of_a_contact():

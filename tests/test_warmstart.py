@@ -119,6 +119,7 @@ def test_missing_markers_are_filled_in():
     assert start(model, Markers(markers.s, holes), NOISE).warm.tolist()[:2] == [False, True], "too few for what it knows: cold"
 
 
+@pytest.mark.many_fits
 def test_a_samples_answer_does_not_depend_on_its_batch():
     """With a NaN neighbour, one that is nonsense, and one out of the learned range."""
     markers, _ = noisy(6)
@@ -165,6 +166,7 @@ class Wild(torch.nn.Module):
 
 
 @pytest.mark.parametrize("kind", ["random weights", "1e3 forces", "not a number"])
+@pytest.mark.many_fits
 def test_a_bad_network_never_costs_accuracy(kind):
     markers, _ = noisy(50)
     start = WarmStart.read(ROD_1)
@@ -212,6 +214,7 @@ def test_a_start_that_leads_nowhere_is_followed_by_a_cold_one():
     assert "cold start" in fit.message(int(retried.nonzero()[0, 0]))
 
 
+@pytest.mark.many_fits
 def test_a_failed_guess_is_followed_by_all_of_a_cold_start():
     """A push whose cold fit needs a restart, and a guess that leads nowhere: the restart must follow it, too."""
     rod = model_of().robot
@@ -335,6 +338,7 @@ def files(folder: Path) -> tuple[Path, Path]:
     return robot, shapes
 
 
+@pytest.mark.many_fits
 def test_the_command_line_starts_where_it_is_told(tmp_path, capsys):
     robot, shapes = files(tmp_path)
 
