@@ -10,6 +10,7 @@ from benchmarks.agreement import Disagreement, Tolerance, fit_differences, linea
 from benchmarks.bars import bars, ratios
 from benchmarks.cases import ITERATION, STUDY, write, write_frames
 from benchmarks.figure import figure
+from benchmarks.measure import steady
 from benchmarks.plans import FULL, QUICK
 from benchmarks.processes import Process
 from benchmarks.report import BEGIN, END, generated, write_page
@@ -86,6 +87,11 @@ def test_ratios_and_bars():
     assert met[linear] is True
     data["linear"]["torchrod"]["4096"] *= 1.11
     assert {bar["what"]: bar["met"] for bar in bars(data)}[linear] is False
+
+
+def test_a_machine_that_is_slower_for_a_while_is_so_for_all():
+    found = steady({"256": [1.0, 2.0, 1.0], "4096": [1.1, 2.2, 1.1]})
+    assert found == pytest.approx({"256": 1.0, "4096": 1.1})
 
 
 def test_a_share_of_work_is_the_same_in_batches_of_every_size(folder, monkeypatch):

@@ -99,9 +99,10 @@ def growth(processes: dict[str, Process], plan: Plan, folder: Path, progress: Pr
 
 
 def linearity(processes: dict[str, Process], plan: Plan, folder: Path, progress: Progress) -> dict[str, dict[str, float]]:
-    """Seconds per sample and iteration, by path and batch: medians over rounds in which every batch does the same work in turn.
+    """Seconds per sample and iteration, by path and batch: every batch does the same work in turn, round by round.
 
-    The fastest of several calls, which serves elsewhere, would favour short ones: they fit between two disturbances.
+    The fastest of several calls, which serves elsewhere, would favour short ones: they fit between two disturbances. Each time is
+    taken over the mean of its round, because a machine that is slower for a minute is so for all; then the median over the rounds.
     """
     able = {name: process for name, process in processes.items() if name in ("torchrod", "numba")}
     data, taken = str(write(ITERATION, folder)), {name: {str(batch): [] for batch in plan.linear} for name in able}
@@ -111,7 +112,16 @@ def linearity(processes: dict[str, Process], plan: Plan, folder: Path, progress:
             for name, process in able.items():
                 answer = process.ask("share", data=data, batch=batch, samples=plan.linear_samples)
                 taken[name][str(batch)].append(answer["seconds"] / plan.linear_samples)
-    return {name: {batch: statistics.median(values) for batch, values in of.items()} for name, of in taken.items()}
+    return {name: steady(of) for name, of in taken.items()}
+
+
+def steady(taken: dict[str, list[float]]) -> dict[str, float]:
+    """Times by batch from those of every round: medians of the ratios to the round's mean, times the median round."""
+    rounds = [statistics.mean(times) for times in zip(*taken.values(), strict=True)]
+    scale = statistics.median(rounds)
+    return {
+        batch: scale * statistics.median(t / mean for t, mean in zip(times, rounds, strict=True)) for batch, times in taken.items()
+    }
 
 
 def by_cores(names: list[str], plan: Plan, folder: Path, caches: Path, progress: Progress) -> dict[str, dict[str, float]]:

@@ -27,7 +27,7 @@ class Plan:
     core_batch: int = 4096
     linear: tuple[int, ...] = (256, 1024, 4096, 16384, 65536)
     linear_samples: int = 65536
-    linear_rounds: int = 9
+    linear_rounds: int = 11
     estimates: dict[str, int] = field(default_factory=lambda: {"torchrod, eager": 256, "scipy": 4, "": 4096})
     memory: tuple[int, ...] = (256, 4096, 65536)
     frames: int = 400

@@ -119,7 +119,12 @@ def generated(data: dict[str, Any], options: str) -> str:
         "",
         *times_table("batch", data["iteration"]),
     ]
-    lines += ["", *ratio_table(data), "", "The same samples in calls of every size, in turn (medians; above: the fastest call):"]
+    lines += [
+        "",
+        *ratio_table(data),
+        "",
+        "The same samples in calls of every size, in turn (above: the fastest call):",
+    ]
     lines += ["", *times_table("batch", data["linear"]), "", "Growth, microseconds per sample:"]
     for what, by_path in data["growth"].items():
         lines += ["", *times_table(what, by_path)]

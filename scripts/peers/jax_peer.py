@@ -22,7 +22,7 @@ from . import DECREMENT, DECREMENT_SHARE, MAX_ITERATIONS, SETTLED, STEP_LIMIT, T
 jax.config.update("jax_enable_x64", True)
 
 # Samples to a call: a compilation for each. The tangents of the largest tuned one still fit the cache.
-SIZES, TUNED_SIZES = (1, 16, 256, 4096), (1, 4, 16, 64)
+SIZES, TUNED_SIZES = (1, 16, 256, 1024, 4096), (1, 4, 16, 64)
 ROOT_PI = np.sqrt(np.pi)
 Array = Any
 
