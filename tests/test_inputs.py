@@ -1,5 +1,7 @@
 """What the Python interface does with tensors that are not quite what it wants."""
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -92,8 +94,9 @@ def test_inference_mode(seen):
 
 def test_locations_may_be_a_list(seen):
     robot = steel_rod()
-    given = [GaussianCoordinates(1, 0.4, robot.rod.force_scale, locations=at) for at in ([0.2], (0.2,))]
-    fits = [estimate(Model(robot, coordinates), Markers(*seen), 1e-3) for coordinates in given]  # pyright: ignore[reportArgumentType]
+    places: list[Any] = [[0.2], (0.2,)]
+    coordinates = [GaussianCoordinates(1, 0.4, robot.rod.force_scale, locations=at) for at in places]
+    fits = [estimate(Model(robot, one), Markers(*seen), 1e-3) for one in coordinates]
     assert torch.equal(fits[0].force, fits[1].force)
 
 
