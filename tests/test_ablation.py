@@ -3,9 +3,13 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from ablations.cases import Case
+from ablations.measure import Run, compared
 
 pytestmark = pytest.mark.many_fits
 ROOT = Path(__file__).resolve().parents[1]
@@ -56,7 +60,19 @@ def test_a_warm_start_costs_nothing(figures, name):
 @pytest.mark.parametrize("name", CASES)
 def test_what_has_converged_has_converged(figures, name):
     for start in ("cold", "warm"):
-        assert figures[name]["convergence"][start]["max"] < 0.01
+        assert -1e-6 < figures[name]["convergence"][start]["max"] < 0.01
+
+
+def test_where_both_end_in_one_minimum_is_told_apart():
+    """Three samples, of which the last ends elsewhere, cheaper and farther from the truth."""
+    one, zero = torch.ones(3), torch.zeros(3)
+    cold = Run(8 * one, one, one, zero, 10 * one, 0.01 * one, 0.1 * one, zero, (1.0, 1.0))
+    warm = replace(cold, iterations=3 * one, chi2=torch.tensor([10.0, 10.005, 9.0]), force=torch.tensor([0.1, 0.1003, 0.4]))
+    case = Case("three", "three samples", (), None, True)
+    found = compared(case, {"cold": cold, "warm": warm, "oracle": cold})
+    assert found["difference"]["force_N"] == pytest.approx(0.1001)
+    assert found["same_minimum"] == {"share": pytest.approx(2 / 3), "location_m": 0.0, "force_N": pytest.approx(1.5e-4)}
+    assert found["better"] == pytest.approx(1 / 3) and found["worse"] == 0
 
 
 @pytest.mark.parametrize("name, bar", [("study1_1mm", 0.75), ("nitinol", 0.75), ("one_tendon", 0.65)])

@@ -12,6 +12,7 @@ from torchrod import (
     GaussianCoordinates,
     Markers,
     Model,
+    PointCoordinates,
     Robot,
     Start,
     WarmStart,
@@ -19,6 +20,8 @@ from torchrod import (
     estimate,
     find_warm_start,
 )
+from torchrod.grid import make_grid
+from torchrod.warmstart import shipped
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +83,7 @@ def test_inference_mode(seen):
     """Tensors made in it do not tell whether they have been changed; what is kept must serve outside of it, too."""
     s, p = seen
     whole = estimate(one_contact(), Markers(s, p), 1e-3)
+    shipped.cache_clear()
     with torch.inference_mode():
         model, markers = one_contact(), Markers(s.clone(), p.clone())
         start = find_warm_start(model)
@@ -88,14 +92,17 @@ def test_inference_mode(seen):
         follow = Estimator(model, s.clone(), 1e-3)
         within += [follow(p[0].clone()), follow(p[0].clone())]
     within += [estimate(model, markers, 1e-3, start=start), follow(p[0])]
+    assert not any(p.is_inference() for p in start.network.parameters()), "they are kept, and packed anew for each call if they are"
     for fit in within:
+        assert not fit.force.is_inference()
         assert torch.allclose(fit.force, whole.force[: len(fit.force)], atol=1e-4)
 
 
-def test_locations_may_be_a_list(seen):
+@pytest.mark.parametrize("kind", [GaussianCoordinates, PointCoordinates])
+def test_locations_may_be_a_list(seen, kind):
     robot = steel_rod()
     places: list[Any] = [[0.2], (0.2,)]
-    coordinates = [GaussianCoordinates(1, 0.4, robot.rod.force_scale, locations=at) for at in places]
+    coordinates = [kind(1, 0.4, robot.rod.force_scale, locations=at) for at in places]
     fits = [estimate(Model(robot, one), Markers(*seen), 1e-3) for one in coordinates]
     assert torch.equal(fits[0].force, fits[1].force)
 
@@ -110,3 +117,10 @@ def test_no_samples_at_all(tendons):
     assert model.h(x, markers).shape == (0, 36)
     with pytest.raises(ValueError, match="at least one sample"):
         estimate(model, markers, 1e-3)
+
+
+def test_the_tip_in_single_precision_is_the_tip():
+    outputs = torch.tensor([0.1, 0.3], dtype=torch.float32).double()
+    assert outputs[-1] > 0.3
+    grid = make_grid(0.3, outputs)
+    assert float(grid.nodes[-1]) == 0.3 and int(grid.outputs[-1]) == len(grid.nodes) - 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-pytest.importorskip("lightning")
+pytest.importorskip("lightning", reason="lightning is not installed: pip install torchrod[train]")
 
 from safetensors.torch import load_file
 

@@ -6,6 +6,8 @@ from torch import Tensor
 
 from .measurement import Markers, Model
 
+TIP = 1e-6  # of the length: so far beyond it, a marker is at the tip, in single precision
+
 
 def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
     """Samples with a marker, as many marker coordinates as unknown loads and registration numbers, and finite tensions."""
@@ -25,7 +27,7 @@ def check(model: Model, markers: Markers, noise: float) -> None:
         raise ValueError(f"noise is {noise} m; it must be positive")
     if len(markers.s) == 0 or len(markers.positions) == 0:
         raise ValueError("there are no markers; give at least one sample with markers")
-    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + 1e-6)).any()):
+    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + TIP)).any()):
         raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
     if 3 * len(markers.s) < model.free_size:
         raise ValueError(

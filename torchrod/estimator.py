@@ -255,6 +255,7 @@ def estimate(
         raise ValueError("an estimate takes one gravity (3,) for all samples; estimate those of each gravity by themselves")
     parts, compiled = [], served(model, markers.positions)
     size = CHUNK if compiled else CHUNK_TORCH
+    # What is kept from call to call, and the answer, must serve outside of inference mode, too.
     with torch.inference_mode(False), one_thread(compiled and len(markers.positions) <= FEW):
         for first in range(0, len(markers.positions), size):
             index = torch.arange(first, min(first + size, len(markers.positions)))

@@ -68,7 +68,7 @@ def white(fit: Estimate) -> Bool[Tensor, " B"]:
 
 
 def _spent(model: Model) -> int:
-    """What the unknowns take of the marker coordinates that a fit uses: 3 of those are nu + this."""
+    """What the unknowns take of the marker coordinates: nu of (1) is 3 for every marker that the fit uses, less this."""
     return model.free_size - model.coordinates.informative_priors
 
 

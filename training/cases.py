@@ -195,7 +195,6 @@ def in_order(gamma: Float[Tensor, "B n"], M: Float[Tensor, "B n n"]) -> tuple[Te
 
 def answered(model: Model, markers: Markers, noise: float, gamma: Float[Tensor, "B n"], iterations: int) -> Float[Tensor, "B n"]:
     """x after so many iterations of the filter from a truth gamma. The start counts as cold: the answer is wanted as it is."""
-
     x = in_equilibrium(model, gamma, markers)
     at_truth = Start.known(torch.where(x.isnan(), cold_start(model, markers, noise).x, x))
     return estimate(model, markers, noise, Settings(max_iterations=iterations, restarts=()), at_truth).x

@@ -12,6 +12,7 @@ from typing import IO
 import numpy as np
 import torch
 
+from ..checks import TIP
 from ..errors import InputError
 from ..files import put_text, reading
 from ..geometry import too_far, too_short
@@ -20,7 +21,6 @@ from ..robot import Robot
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
-TIP = 1e-6  # of the length: so far beyond it, a marker is at the tip, in single precision
 
 
 @dataclass(frozen=True)
