@@ -124,10 +124,11 @@ class _Course:
             iterations[live] += 1
             far, close = live[~near[live]], live[near[live]]
             if len(far):
-                near[far] = rough_once(far)
-                near[far] |= 2 * iteration >= self.most
+                rough_once(far)
+                near[far] = at.done[far] | (2 * iteration >= self.most)
             if len(close):
-                done = once(close)
+                once(close)
+                done = at.done[close]
                 converged[close[done]] = True
                 live = torch.cat([far, close[~done]]).sort().values
         return converged, iterations

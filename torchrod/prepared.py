@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from . import ekf, fast
@@ -260,11 +260,11 @@ class Prepared:
 
     def iteration(
         self, at: ekf.Iterate, Sigma0: Float[Tensor, "B n n"], Q: Float[Tensor, " n"], limits: ekf.Limits, sums: fast.Sums
-    ) -> Callable[[Int[Tensor, " b"]], Bool[Tensor, " b"]]:
-        """One iteration of the filter on some samples, in place; it returns which of them are done, whose sums are kept."""
+    ) -> Callable[[Int[Tensor, " b"]], None]:
+        """One iteration of the filter on some samples, in place: at.done then says which of them are done, whose sums are kept."""
         call = self.compiled_iteration(at, Sigma0, Q, limits, sums) if self.compiled else None
 
-        def once(live: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
+        def once(live: Int[Tensor, " b"]) -> None:
             if call is not None:
                 call(self.tables(at.x), live)
             else:
@@ -272,6 +272,5 @@ class Prepared:
                 found = part.sums(here.x)
                 at.put(live, ekf.advance(here, part.normal(found), Sigma0[live], self._prior, Q, limits))
                 sums.put(live, found)
-            return at.done[live]
 
         return once

@@ -42,7 +42,6 @@ class TorchrodPeer:
             parts = [slice(k, k + CHUNK) for k in range(0, len(x), CHUNK)]
             state = x, Sigma, self._before, cap, self._done
             self._calls = [self._once(positions[p], [a[p] for a in state]) for p in parts]
-        np.copyto(self._before, x)
         for once in self._calls:
             once()
         return x, Sigma, cap, self._done

@@ -1,29 +1,11 @@
 // The library's entry points: each shares its samples among threads, in groups of W.
 
-#include <algorithm>
-#include <atomic>
-#include <thread>
-
 #include "balance.h"
 #include "filter.h"
 #include "mlp.h"
+#include "threads.h"
 
 namespace {
-
-// work(from, to) for parts of 0 .. count, several to a thread and no smaller than `least`: a thread takes the next one when it is free,
-// so that a core which is busy elsewhere does not keep the others waiting.
-template <class Work> void in_parts(int64_t count, int64_t least, int64_t threads, Work work) {
-    const int64_t size = std::max(least, count / (16 * threads) + 1);
-    if (threads <= 1 || size >= count) return work(int64_t(0), count);
-    std::atomic<int64_t> next{0};
-    auto some = [&] {
-        for (int64_t from; (from = next.fetch_add(size)) < count;) work(from, std::min(from + size, count));
-    };
-    std::vector<std::thread> pool;
-    for (int64_t t = 1; t < threads; t++) pool.emplace_back(some);
-    some();
-    for (auto& thread : pool) thread.join();
-}
 
 // work(lanes, room, numbers) for groups of W samples.
 template <class Work> void in_groups(int64_t count, const int64_t* index, int64_t threads, Work work) {

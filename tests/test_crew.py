@@ -1,0 +1,109 @@
+"""The kernel's threads, which live on: through forks, beside other callers, and no more of them than were asked for."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.robots import T, steel_rod
+from tests.test_fast import needs_compiler
+from torchrod import GaussianCoordinates, Markers, Model, fast
+from torchrod.prepared import Prepared
+
+BEGIN = """
+import os, threading
+import torch
+from torchrod import fast
+torch.set_num_threads(1)
+torch.set_default_dtype(torch.float64)
+from tests import test_crew
+assert fast.library(wait=True) is not None
+call, tasks = test_crew.caller(400), lambda: len(os.listdir("/proc/self/task"))
+torch.set_num_threads(3)
+"""
+
+
+def caller(samples: int):
+    """The normal equations of so many samples: the kernel, and nothing of torch that has threads of its own."""
+    model, markers = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0)), Markers(T([0.1, 0.4]), torch.zeros(samples, 2, 3))
+    x = torch.randn(samples, model.size, generator=torch.Generator().manual_seed(0)) * 0.3
+    prepared = Prepared(model, markers, model.weights(markers, 1e-3))
+    return lambda: prepared.sums(x)
+
+
+def same(a: fast.Sums, b: fast.Sums) -> bool:
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in vars(a))
+
+
+def run(code: str) -> None:
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", BEGIN + code], capture_output=True, text=True, check=False, cwd=root, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /proc here, which counts a process's threads")
+
+
+@needs_compiler
+@linux
+def test_threads_are_begun_once():
+    run("""
+call()
+before = tasks()
+for _ in range(20):
+    call()
+assert tasks() == before, (before, tasks())
+torch.set_num_threads(5)
+call()
+assert tasks() == before + 2, (before, tasks())
+""")
+
+
+@needs_compiler
+@linux
+def test_a_fork_has_threads_of_its_own_whatever_its_parents_were_doing():
+    run("""
+whole, stop, failed = call(), threading.Event(), 0
+def busy():
+    while not stop.is_set():
+        call()
+other = threading.Thread(target=busy)
+other.start()
+for _ in range(20):  # the other thread is in the kernel at nearly any time
+    child = os.fork()
+    if child == 0:
+        before, found, after = tasks(), call(), tasks()
+        os._exit((before, after, test_crew.same(found, whole)) != (1, 3, True))
+    failed += os.waitpid(child, 0)[1] != 0
+stop.set()
+other.join()
+assert failed == 0
+""")
+
+
+@needs_compiler
+def test_callers_at_once_get_the_answers_of_each_alone():
+    calls = [caller(samples) for samples in (40, 90, 400, 401)]
+    alone, found = [call() for call in calls], [[] for _ in calls]
+    start = threading.Barrier(len(calls))
+
+    def ask(k: int) -> None:
+        start.wait()
+        found[k].extend(calls[k]() for _ in range(10))
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        threads = [threading.Thread(target=ask, args=(k,)) for k in range(len(calls))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        torch.set_num_threads(before)
+    for one, several in zip(alone, found, strict=True):
+        assert len(several) == 10
+        assert all(same(one, other) for other in several)
