@@ -177,8 +177,9 @@ static void run(const Course& c, const int64_t* index, int64_t count) {
 }
 
 void torchrod_filter(const Course* c, const int64_t* index, int64_t count, int64_t threads) {
-    // Each part ends with lanes that are not filled; in parts this large that is a few percent.
-    in_parts(count, 32 * W, threads, [&](int64_t from, int64_t to) { run(*c, index + from, to - from); });
+    // Each part ends with lanes that are not filled: in parts of 32 groups that is a few percent. But four to a thread there should be.
+    const int64_t groups = (count + W - 1) / W, least = std::clamp(groups / (4 * threads), int64_t(4), int64_t(32));
+    in_parts(groups, least, threads, [&](int64_t from, int64_t to) { run(*c, index + from * W, std::min(count, to * W) - from * W); });
 }
 
 // The base wrench (b, 6) in equilibrium with the loads of x (b, n), how far it is from that (b), the centre line (b, P, 3) and the
