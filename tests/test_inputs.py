@@ -9,16 +9,30 @@ from tests.robots import busy_robot, steel_rod
 from tests.study import study1
 from torchrod import (
     Estimator,
+    FourierLoads,
     GaussianCoordinates,
+    GaussianLoads,
     Markers,
     Model,
     PointCoordinates,
+    PointForces,
+    PointWrenches,
+    PolynomialLoads,
     Robot,
+    Rod,
     Start,
+    Tendon,
+    Tendons,
     WarmStart,
+    bounds,
     cold_start,
     estimate,
     find_warm_start,
+    load_bound,
+    place,
+    shape_from_base,
+    solve_displacement,
+    solve_shape,
 )
 from torchrod.grid import make_grid
 from torchrod.warmstart import shipped
@@ -49,6 +63,49 @@ def test_numbers_of_single_precision(seen):
         assert torch.allclose(fit.force, whole.force, atol=1e-4) and fit.accepted.all()
     follow = Estimator(model, s.float(), 1e-3)
     assert torch.allclose(follow(p[0].float()).force[0], whole.force[0], atol=1e-3)
+
+
+def f(*numbers: object) -> torch.Tensor:
+    """As torch.tensor makes it where nobody has asked for float64."""
+    return torch.tensor(numbers, dtype=torch.float32)
+
+
+LOADS = {
+    "gaussian": lambda: GaussianLoads(f([8.0, -3.0]).unsqueeze(0), f([0.25]), f([5e3])),
+    "point": lambda: PointForces(f([[0.6, -0.3, 0.0]]), f([0.25])),
+    "wrench": lambda: PointWrenches(f([0.1, 0.0, -0.1]), f([0.0, 0.01, 0.0]), f(0.3)),
+    "fourier": lambda: FourierLoads(f([0.5, 0.2], [0.1, 0.0]), f([0.1], [0.2]), 0.4),
+    "polynomial": lambda: PolynomialLoads(f([0.5, 0.2], [0.1, 0.0]), 0.4),
+}
+
+
+@pytest.mark.parametrize("kind", LOADS)
+def test_known_loads_of_single_precision(kind):
+    """Forward solves, as a user writes them who has not read that physics is done in float64."""
+    torch.set_default_dtype(torch.float32)
+    load, s = LOADS[kind](), f(0.1, 0.2, 0.4)
+    rod = Rod.circular(0.4, 1.4e-3, 207e9, 79e9, mass_per_length=0.012)
+    robot = Robot(rod, Tendons((Tendon.straight(0.01, 0.0, 0.4),)), f(0.0, -9.81, 0.0))
+    solved = solve_shape(robot, (load,), f([1.0]), s, 1)
+    assert solved.p.dtype == torch.float64 and solved.status == 0
+    pulled = solve_displacement(robot, (load,), f([1e-3]), s)
+    assert pulled.equilibrium.p.dtype == torch.float64 and pulled.equilibrium.status == 0
+    again = shape_from_base(robot, (load,), solved.base_wrench.float(), f([1.0]), s, 40)
+    assert (again.p - solved.p).abs().max() < 1e-5  # what float32 leaves of the base wrench
+
+
+def test_bounds_and_placement_of_single_precision():
+    torch.set_default_dtype(torch.float32)
+    robot = Robot(Rod.circular(0.4, 1.4e-3, 207e9, 79e9), Tendons((Tendon.straight(0.01, 0.0, 0.4),)))
+    s, tension = torch.linspace(0.02, 0.4, 20), f(1.0)
+    found = bounds(robot, s, 1e-3, 0.5, f(0.2, 0.3), tension, directions=2)
+    same = bounds(robot, s.double(), 1e-3, 0.5, f(0.2, 0.3).double(), tension.double(), directions=2)
+    assert torch.equal(found.location_std, same.location_std)
+    markers, force, where = Markers(s, torch.zeros(1, 20, 3), tension=f([1.0])), f([0.5, 0.0]), f(0.3)
+    wrench = solve_shape(robot, (PointForces(f([[0.5, 0.0, 0.0]]), f([0.3])),), f([1.0]), s, 1).base_wrench
+    single, double = (load_bound(robot, markers, force.to(t), where.to(t), wrench, 1e-3) for t in (torch.float32, torch.float64))
+    assert torch.equal(single[0], double[0])
+    assert place(robot, 4, 1e-3, 0.5, tension, directions=2).s.dtype == torch.float64
 
 
 @pytest.mark.parametrize(
@@ -124,3 +181,20 @@ def test_the_tip_in_single_precision_is_the_tip():
     assert outputs[-1] > 0.3
     grid = make_grid(0.3, outputs)
     assert float(grid.nodes[-1]) == 0.3 and int(grid.outputs[-1]) == len(grid.nodes) - 1
+
+
+def test_places_off_the_rod():
+    """A point load off it makes its own sample invalid; outputs off it are refused; the tip may be a float32's breadth beyond."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20, dtype=torch.float32)
+    force, moment = torch.tensor([[[0.6, -0.3, 0.0]]]), torch.zeros(1, 1, 3)
+    whole = solve_shape(robot, (PointForces(force, torch.tensor([[0.4]])),), None, s, 3)
+    places = torch.tensor([[0.4], [0.5], [-0.01]])
+    for load in (PointForces(force, places), PointForces(force, places.float())):
+        solved = solve_shape(robot, (load,), None, s, 3)
+        assert solved.status.tolist() == [0, 2, 2]
+        assert (solved.p[0] - whole.p[0]).abs().max() < 1e-7 and solved.p[1:].isnan().all()
+    wrench = PointWrenches(force, moment, torch.tensor([0.5]))
+    assert solve_shape(robot, (wrench,), None, s, 1).status.tolist() == [2]
+    for beyond in (torch.tensor([0.1, 0.41]), torch.tensor([-0.1, 0.4]), torch.tensor([0.1, torch.nan])):
+        with pytest.raises(ValueError, match=r"outside the rod of 0 to 0.4 m"):
+            solve_shape(robot, (), None, beyond, 1)

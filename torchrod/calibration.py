@@ -19,9 +19,9 @@ from .coordinates import GaussianCoordinates
 from .estimator import Settings
 from .grid import DEFAULT_STEPS
 from .measurement import Markers, Model
+from .precision import DTYPE
 from .result import ACCEPT, Z95
 from .robot import Robot
-from .rod import DTYPE
 from .status import Status
 from .tendons import Tendons
 from .unloaded import MASS, OFFSET, PRIOR, STIFFNESS, Trial, UnloadedShapes

@@ -4,9 +4,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from .grid import on_rod
 from .measurement import Markers, Model
-
-TIP = 1e-6  # of the length: so far beyond it, a marker is at the tip, in single precision
 
 
 def usable(model: Model, markers: Markers) -> Bool[Tensor, " B"]:
@@ -27,7 +26,7 @@ def check(model: Model, markers: Markers, noise: float) -> None:
         raise ValueError(f"noise is {noise} m; it must be positive")
     if len(markers.s) == 0 or len(markers.positions) == 0:
         raise ValueError("there are no markers; give at least one sample with markers")
-    if bool((markers.s < 0).any()) or bool((markers.s > L * (1 + TIP)).any()):
+    if not bool(on_rod(markers.s, L).all()):
         raise ValueError(f"marker arc lengths run from {markers.s.min()} to {markers.s.max()} m, outside the rod of 0 to {L} m")
     if 3 * len(markers.s) < model.free_size:
         raise ValueError(

@@ -18,8 +18,8 @@ from torch import Tensor
 from . import fast
 from .errors import InputError
 from .loads import GaussianLoads, Load, PointForces, on_rod_fraction
+from .precision import DTYPE
 from .robot import Robot
-from .rod import DTYPE
 from .statics import solve_shape
 from .status import Status
 from .threads import one_thread

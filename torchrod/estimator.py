@@ -13,9 +13,9 @@ from .checks import check, usable
 from .coordinates import PaperCoordinates
 from .fast import Sums, iterate_all
 from .measurement import Markers, Model
+from .precision import DTYPE
 from .prepared import Prepared, served
 from .result import Estimate, make_estimate
-from .rod import DTYPE
 from .starts import Start, StartRule, better_start, cold_start, in_equilibrium
 from .status import Learned, Status
 from .threads import one_thread

@@ -35,8 +35,8 @@ from torch import Tensor
 from .equilibrium import without_load
 from .kept import version
 from .measurement import Markers, Model
+from .precision import DTYPE
 from .robot import Robot
-from .rod import DTYPE
 
 GRID = 20  # points of the grid
 STATIONS = 4  # where the known loads are described

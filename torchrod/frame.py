@@ -22,8 +22,8 @@ from . import ekf
 from .estimator import Settings, estimate, linearize
 from .lie import matvec
 from .measurement import Markers, Model
+from .precision import DTYPE
 from .result import Estimate, load_covariance
-from .rod import DTYPE
 from .status import Status
 
 Parts = Sequence[tuple[Model, Int[Tensor, " b"]]]

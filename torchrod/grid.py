@@ -3,11 +3,17 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 DEFAULT_STEPS = 40  # RK4 is then within 1e-7 m of the exact shape for ordinary loads (docs/model.md)
 SAME_POINT = 1e-9  # m: marker and tendon end closer than this share a node
+TIP = 1e-6  # of the length: so far beyond it, a place is at the tip, in single precision
+
+
+def on_rod(s: Float[Tensor, "*K"], length: float) -> Bool[Tensor, "*K"]:
+    """Whether arc lengths (m) lie on the rod; NaN does not."""
+    return (s >= -SAME_POINT) & (s <= length * (1 + TIP))
 
 
 @dataclass(frozen=True)
@@ -55,8 +61,13 @@ def make_grid(
     breakpoints: Float[Tensor, "... K"] | None = None,
     steps: int = DEFAULT_STEPS,
 ) -> Grid:
-    """Nodes at 0, L, the outputs, the tendon ends and the breakpoints, filled up so that no step is longer than L / steps (m)."""
-    outputs = outputs.clamp(max=length)  # the tip in single precision lies beyond it
+    """Nodes at 0, L, the outputs, the tendon ends and the breakpoints, filled up so that no step is longer than L / steps (m).
+
+    Errors: ValueError for outputs that do not lie on the rod.
+    """
+    if not bool(on_rod(outputs, length).all()):
+        raise ValueError(f"outputs run from {float(outputs.min())} to {float(outputs.max())} m, outside the rod of 0 to {length} m")
+    outputs = outputs.clamp(0.0, length)  # the tip in single precision lies beyond it
     fixed = torch.cat([outputs.new_tensor([0.0, length, *ends]), outputs]).sort().values
     fixed = fixed[torch.cat([torch.tensor([True]), fixed.diff() > SAME_POINT])]
     pieces = (fixed.diff() / (length / steps) - 1e-9).ceil().clamp(min=1).to(torch.int64)

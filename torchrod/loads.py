@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .lie import Vector
+from .precision import Float64
 
 ArcLength = Float[Tensor, "..."]
 
@@ -81,7 +82,7 @@ def _per_stage(parameter: Tensor, trailing: int) -> Tensor:
 
 
 @dataclass(frozen=True)
-class GaussianLoads:
+class GaussianLoads(Float64):
     """f(s) = sum_k a_k exp(-c_k (s - mu_k)^2), (10), with 2 c = 1 / sigma^2.
 
     a: (..., K, 2), N/m, section frame x and y. mu: (..., K), m. c: (..., K), 1/m^2.
@@ -130,7 +131,7 @@ def on_rod_fraction(mu: Float[Tensor, "... K"], c: Float[Tensor, "... K"], lengt
 
 
 @dataclass(frozen=True)
-class PointForces:
+class PointForces(Float64):
     """Point forces (Dirac loads) in the section frame. force: (..., K, 3), N. s: (..., K), m, on the rod, the tip included."""
 
     force: Float[Tensor, "... K 3"]
@@ -153,7 +154,7 @@ class PointForces:
 
 
 @dataclass(frozen=True)
-class PointWrenches:
+class PointWrenches(Float64):
     """Known forces (N) and moments (N m), (..., K, 3), at s (K,) m.
 
     frame "local" turns with the section, "base" keeps its direction.
@@ -182,7 +183,7 @@ class PointWrenches:
 
 
 @dataclass(frozen=True)
-class FourierLoads:
+class FourierLoads(Float64):
     """f(s) = a_0 + sum_k a_k cos(2 pi k s / L) + b_k sin(2 pi k s / L), k = 1..K periods on the rod, (12).
 
     cosine: (..., 2, K + 1) with a_0 first; sine: (..., 2, K); N/m, section frame x and y.
@@ -221,7 +222,7 @@ class FourierLoads:
 
 
 @dataclass(frozen=True)
-class PolynomialLoads:
+class PolynomialLoads(Float64):
     """f(s) = sum_k a_k (s / L)^k. coefficients: (..., 2, K), N/m, section frame x and y."""
 
     coefficients: Float[Tensor, "... 2 K"]

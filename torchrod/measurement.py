@@ -21,8 +21,8 @@ from .jacobian import forward_jacobian
 from .lie import move, rotate, unrotate
 from .loads import LoadIntegrals, total
 from .march import march_linearized
+from .precision import Float64
 from .robot import Robot
-from .rod import DTYPE
 from .statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table
 from .step import Section
 
@@ -37,13 +37,12 @@ TURN_SCALE = 0.1  # rad, one unit of a registration angle; a unit of translation
 
 
 @dataclass(frozen=True)
-class Markers:
+class Markers(Float64):
     """Measured markers of B samples.
 
     s: (P,) m, arc lengths. positions: (B, P, 3) m, base frame, NaN where a marker is missing. offsets: (P, 3) m, from the centre
     line in the section frame, so that the marker sits at p(s) + R(s) r. tension: (B, T) N for a tendon robot. sigma: (B,) m, each
-    sample's own noise, which then goes before the one that an estimate is given (torchrod.estimate_noise). Numbers of another
-    precision are made float64.
+    sample's own noise, which then goes before the one that an estimate is given (torchrod.estimate_noise).
     """
 
     s: Float[Tensor, " P"]
@@ -51,11 +50,6 @@ class Markers:
     offsets: Float[Tensor, "P 3"] | None = None
     tension: Float[Tensor, "B T"] | None = None
     sigma: Float[Tensor, " B"] | None = None
-
-    def __post_init__(self):
-        for name, value in vars(self).items():
-            if value is not None and value.dtype != DTYPE:
-                object.__setattr__(self, name, value.to(DTYPE))
 
     @property
     def misshapen(self) -> str | None:

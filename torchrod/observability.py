@@ -19,11 +19,11 @@ from scipy.special import chdtri, chndtr
 from torch import Tensor
 
 from .coordinates import GaussianCoordinates
-from .grid import DEFAULT_STEPS
+from .grid import DEFAULT_STEPS, on_rod
 from .loads import PointForces
 from .measurement import Markers, Model
+from .precision import DTYPE, as_float64
 from .robot import Robot
-from .rod import DTYPE
 from .statics import solve_shape
 
 PUSH_WIDTH = 1 / 400  # sigma / L of a push: 1 mm on the paper's rod
@@ -156,6 +156,7 @@ def load_bound(
     frame_std: with registration, what is known of the base frame (m, rad), as Model.frame_std.
     A bound is inf where the markers do not show the push, NaN where the base wrench is.
     """
+    force, location, base_wrench = as_float64(force), as_float64(location), as_float64(base_wrench)
     model = push_model(robot, registration, steps, frame_std)
     unknown = (0, 1, 2) if width_known else (0, 1, 2, 3)
     C, singular = _bounded(model, state(model, force, location, base_wrench), markers, noise, unknown)
@@ -235,7 +236,8 @@ def bounds(
     Errors: ValueError for markers, force, noise or tensions that do not fit the robot.
     """
     check(robot, s, noise, force, tension)
-    at = places(robot, PLACES) if locations is None else locations
+    s, tension = as_float64(s), as_float64(tension)
+    at = places(robot, PLACES) if locations is None else as_float64(locations)
     angle, e = around(directions)
     model, K = push_model(robot, registration, steps), len(at)
 
@@ -261,7 +263,7 @@ def check(robot: Robot, s: Float[Tensor, " P"], noise: float, force: float, tens
         raise ValueError(f"force is {force} N; it must be positive")
     if len(s) < 2:
         raise ValueError(f"{len(s)} markers cannot show where a push is; give at least 2")
-    if not bool(((s > 0) & (s <= L * (1 + 1e-9))).all()):
+    if not bool((on_rod(s, L) & (s > 0)).all()):
         raise ValueError(
             f"marker arc lengths run from {float(s.min())} to {float(s.max())} m; they must be above 0 and at most {L} m"
         )

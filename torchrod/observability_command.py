@@ -13,8 +13,8 @@ from .errors import InputError
 from .io import read_robot, write_observability, write_observability_table
 from .observability import BENDS, LOCALIZED, Observability, bounds
 from .placement import Placement, even_layout, place
+from .precision import DTYPE
 from .robot import Robot
-from .rod import DTYPE
 
 DEFAULT_MARKERS = 20
 MOST_MARKERS = 200

@@ -20,8 +20,8 @@ from .fit import Fit
 from .grid import DEFAULT_STEPS
 from .lie import move, rotate
 from .measurement import Markers
+from .precision import DTYPE
 from .robot import Robot
-from .rod import DTYPE
 from .statics import shape_from_base
 
 INK, LOAD, MARKER, TENDON, TRUTH = "#1b2a41", "#c8102e", "#0a7f8c", "#9a9a9a", "#b5b5b5"

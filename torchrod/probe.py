@@ -23,7 +23,7 @@ from .coordinates.base import logit
 from .estimator import linearize
 from .loads import GaussianLoads, Load
 from .measurement import Markers, Model
-from .rod import DTYPE
+from .precision import DTYPE
 from .starts import Start
 
 PLACES = 16  # along the rod, evenly spaced up to the tip: closer than two pushes can be told apart

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from .measurement import Model
-from .rod import DTYPE
+from .precision import DTYPE
 
 NODES = 101
 DRAWS = 256  # half of them antithetic; a power of two

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from .lie import Vector
 from .loads import LoadIntegrals
-from .rod import DTYPE, Rod
+from .precision import DTYPE, Float64
+from .rod import Rod
 from .tendons import Tendons
 
 
 @dataclass(frozen=True)
-class Robot:
+class Robot(Float64):
     """A rod with tendons in a gravity field. gravity: (3,) or (B, 3), m/s^2, base frame."""
 
     rod: Rod

@@ -8,12 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .lie import Matrix
-
-DTYPE = torch.float64
+from .precision import DTYPE, Float64
 
 
 @dataclass(frozen=True)
-class Rod:
+class Rod(Float64):
     """A straight or pre-curved rod of uniform section, clamped at s = 0, leaving the base frame along +z.
 
     Constitutive law in the section frame: n = K_se (v - e3), m = K_bt (u - u*).
@@ -57,9 +56,7 @@ class Rod:
         """Any section, by its symmetric positive definite stiffness matrices (N and N m^2, section frame)."""
         if reference_curvature is None:
             reference_curvature = torch.zeros(1, 4, dtype=DTYPE)
-        return cls(
-            length, K_se.to(DTYPE), K_bt.to(DTYPE), torch.as_tensor(mass_per_length, dtype=DTYPE), reference_curvature.to(DTYPE)
-        )
+        return cls(length, K_se, K_bt, torch.as_tensor(mass_per_length, dtype=DTYPE), reference_curvature)
 
     @property
     def bending_stiffness(self) -> float:

@@ -15,10 +15,10 @@ from .errors import InputError
 from .io import Shapes, has_shard, prepare_folder, read_dataset_spec, read_robot, write_manifest, write_shapes
 from .loads import Load, PointForces, PointWrenches
 from .measurement import Markers
+from .precision import DTYPE
 from .production import produce
 from .progress import bar
 from .robot import Robot
-from .rod import DTYPE
 from .statics import Equilibrium, solve_shape
 from .status import Status
 

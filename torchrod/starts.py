@@ -9,17 +9,17 @@ from torch import Tensor
 
 from .equilibrium import at_rest, without_load
 from .measurement import Markers, Model
+from .precision import Float64
 from .prepared import Prepared
-from .rod import DTYPE
 
 
 @dataclass(frozen=True)
-class Start:
+class Start(Float64):
     """Where B samples start: x (B, n) in the model's coordinates.
 
     Sigma0: the covariance (B, n, n) to start with; None leaves it to the settings. warm: (B,), which samples start from a guess;
     the others start cold, from no load. cold: x of a cold start, and costs (B, 2) of x and of that by the model, if the rule has
-    them at hand. Numbers of another precision are made float64.
+    them at hand.
     """
 
     x: Float[Tensor, "B n"]
@@ -27,12 +27,6 @@ class Start:
     warm: Bool[Tensor, " B"]
     cold: Float[Tensor, "B n"] | None = None
     costs: Float[Tensor, "B 2"] | None = None
-
-    def __post_init__(self):
-        for name in ("x", "Sigma0", "cold", "costs"):
-            value = getattr(self, name)
-            if value is not None and value.dtype != DTYPE:
-                object.__setattr__(self, name, value.to(DTYPE))
 
     @classmethod
     def known(cls, x: Float[Tensor, "B n"]) -> "Start":

@@ -11,22 +11,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .grid import DEFAULT_STEPS, Grid, make_grid
+from .grid import DEFAULT_STEPS, Grid, make_grid, on_rod
 from .jacobian import pointwise_jacobian
-from .lie import (
-    Quaternion,
-    Vector,
-    cross,
-    identity_quaternion,
-    inverse3,
-    logarithm,
-    matvec,
-    normalized,
-    rotate,
-    turned,
-)
+from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logarithm, matvec, normalized, rotate, turned
 from .loads import Load, LoadIntegrals, total
 from .march import march, march_linearized, states_at
+from .precision import as_float64
 from .robot import Robot
 from .status import Status
 from .step import STATE_PARTS, Section, StageTable, State, section_wrench
@@ -118,6 +108,7 @@ def shape_from_base(
 
     differentiable=False takes the compiled march where it serves, for alpha (B, 6) outside of any transform.
     """
+    alpha, tension, outputs = as_float64(alpha), as_float64(tension), as_float64(outputs)
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
@@ -232,9 +223,11 @@ def solve_shape(
     Marches tip to base and turns the tip until the base sits in its clamp, R(0) = I: at once without base-frame loads, by damped
     Newton on three numbers with them, until the base misses it by less than the tolerance (rad). Loads (B, ...) in their own frames
     and units (torchrod.loads), tension N, outputs m. q_tip: where to look for the tip's orientation, with all of the load at once.
-    Errors: none raised for numbers; a sample that cannot be solved has status NOT_CONVERGED, one that holds NaN INVALID.
+    Errors: ValueError for outputs off the rod. A sample that cannot be solved has status NOT_CONVERGED; one that holds NaN, or a
+    point load off the rod, INVALID.
     Source: docs/model.md.
     """
+    tension, outputs, q_tip = as_float64(tension), as_float64(outputs), as_float64(q_tip)
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
@@ -243,7 +236,11 @@ def solve_shape(
     # At L+ the section carries nothing: N = M = 0 in (1), hence N~ = G and M~ = Gm - e3 x G2 there.
     N = zero if beyond.G is None else zero + beyond.G
     M = zero if beyond.G2 is None else zero - cross(section.e3, beyond.G2)
-    problem = _TipProblem(section, table, grid, torch.cat([N, M if beyond.Gm is None else M + beyond.Gm], -1))
+    wrench = torch.cat([N, M if beyond.Gm is None else M + beyond.Gm], -1)
+    for place in (load.breakpoints() for load in loads):
+        if place is not None:  # torch has no exception for a sample: NaN makes it INVALID
+            wrench = torch.where(on_rod(place, robot.rod.length).all(-1, keepdim=True), wrench, torch.nan)
+    problem = _TipProblem(section, table, grid, wrench)
 
     q, one = identity_quaternion((batch,), zero), torch.ones_like(zero[:, 0])
     dead = table.loads.Wn is not None or table.loads.Wm is not None

@@ -6,8 +6,8 @@ from torch import Tensor
 
 from .estimator import Settings, estimate
 from .measurement import Markers, Model
+from .precision import DTYPE
 from .result import Estimate
-from .rod import DTYPE
 from .starts import Start, StartRule, cold_start
 from .warmstart import find_warm_start
 

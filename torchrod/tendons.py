@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .lie import Matrix, Vector, hat, inverse3, matvec
-from .rod import DTYPE
+from .precision import DTYPE
 
 # Stiff rods: values to round-off and derivatives to 1e-9 (with two steps 1e-12 and only 1e-5). One more, differentiated, follows.
 NEWTON_STEPS = 3

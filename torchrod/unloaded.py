@@ -30,8 +30,8 @@ from . import ekf
 from .estimator import CHUNK, Linearized
 from .lie import rotate
 from .measurement import Markers
+from .precision import DTYPE
 from .robot import Robot
-from .rod import DTYPE
 from .statics import solve_shape
 from .tendons import Tendons
 

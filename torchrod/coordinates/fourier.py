@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..loads import FourierLoads, Load
-from ..rod import DTYPE
+from ..precision import DTYPE
 from .base import WEAK_STD, Gamma, LoadReport
 
 

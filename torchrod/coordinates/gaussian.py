@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..loads import GaussianLoads, Load, on_rod_fraction
-from ..rod import DTYPE
+from ..precision import DTYPE
 from .base import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
 
 WIDTH_OF_PRIOR = {"point": 1 / 100, "contact": 1 / 40, "distributed": 1 / 4}  # sigma / L: 4, 10 and 100 mm on the paper's rod

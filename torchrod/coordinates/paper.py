@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..loads import GaussianLoads, Load, on_rod_fraction
-from ..rod import DTYPE
+from ..precision import DTYPE
 from .base import Gamma, LoadReport, logit
 
 

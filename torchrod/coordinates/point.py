@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..lie import Vector
 from ..loads import Load, PointForces
-from ..rod import DTYPE
+from ..precision import DTYPE
 from .base import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 
 from ..errors import InputError
+from ..precision import DTYPE
 from ..robot import Robot
-from ..rod import DTYPE, Rod
+from ..rod import Rod
 from ..tendons import Tendon, Tendons
 from .values import as_number, as_numbers, as_rows, as_table, read_toml
 

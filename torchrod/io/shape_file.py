@@ -12,10 +12,10 @@ from typing import IO
 import numpy as np
 import torch
 
-from ..checks import TIP
 from ..errors import InputError
 from ..files import put_text, reading
 from ..geometry import too_far, too_short
+from ..grid import on_rod
 from ..measurement import Markers
 from ..robot import Robot
 
@@ -42,7 +42,7 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
         with path.open("rb") as file:
             shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
     markers, L = shapes.markers, robot.rod.length
-    outside = (markers.s < -1e-9) | (markers.s > L * (1 + TIP))
+    outside = ~on_rod(markers.s, L)
     if bool(outside.any()):
         hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")

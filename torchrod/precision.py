@@ -1,0 +1,26 @@
+"""float64 for physics, whatever precision numbers come in."""
+
+from typing import overload
+
+import torch
+from torch import Tensor
+
+DTYPE = torch.float64
+
+
+@overload
+def as_float64(x: Tensor) -> Tensor: ...
+@overload
+def as_float64(x: None) -> None: ...
+def as_float64(x: Tensor | None) -> Tensor | None:
+    """The same numbers in float64; the tensor itself where it is of that type."""
+    return None if x is None else x.to(DTYPE)
+
+
+class Float64:
+    """A frozen dataclass whose tensors of numbers are made float64; flags stay flags."""
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor) and value.dtype not in (DTYPE, torch.bool):
+                object.__setattr__(self, name, value.to(DTYPE))
