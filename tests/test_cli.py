@@ -159,6 +159,7 @@ def test_the_hypothesis_of_an_npz_has_a_name(tmp_path):
         assert main(["estimate", *paths, *options]) == 0
     (record,) = json.loads((tmp_path / "e.json").read_text())["results"]
     with np.load(tmp_path / "e.npz", allow_pickle=False) as arrays:
+        assert arrays["messages"][arrays["message"][0]] == record["message"]
         assert arrays["hypotheses"][arrays["hypothesis"][0]] == record["evidence"]["chosen"]
         assert arrays["hypotheses"].tolist() == list(record["evidence"]["bic"])
         assert arrays["bic"].shape == arrays["bic_foreseen"].shape == (1, len(arrays["hypotheses"]))

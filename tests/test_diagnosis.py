@@ -3,6 +3,7 @@
 import json
 import math
 
+import numpy as np
 import pytest
 import roma
 import torch
@@ -131,8 +132,7 @@ def test_the_command_line_tells(tmp_path, capsys):
     positions[1] = off(positions[1])
     write_shapes(tmp_path / "shapes.csv", Shapes(Markers(clean.s, positions), ["swapped", "moved", "clean"]))
     for count in ("1", "auto"):
-        out = str(tmp_path / "result.json")
-        options = ["--contacts", count, "--out", out]
+        options = ["--contacts", count, "--out", str(tmp_path / "result.json")]
         assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), *options]) == 0
         said = capsys.readouterr().out
         assert "Markers 7 and 12 (s = 140 and 240 mm) look exchanged" in said
@@ -145,6 +145,11 @@ def test_the_command_line_tells(tmp_path, capsys):
         assert "try --registration" in moved["message"]
         assert moved["suspect_markers"] == unhurt["suspect_markers"] == []
         assert unhurt["message"] == "Converged."
+        options[-1] = str(tmp_path / "result.npz")
+        assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), *options]) == 0
+        capsys.readouterr()
+        with np.load(tmp_path / "result.npz", allow_pickle=False) as arrays:
+            assert arrays["messages"][arrays["message"]].tolist() == [record["message"] for record in (swapped, moved, unhurt)]
 
 
 @pytest.mark.parametrize("count", [1, 2])
