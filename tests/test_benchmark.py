@@ -11,14 +11,14 @@ from benchmarks.bars import bars, ratios
 from benchmarks.cases import ITERATION, STUDY, write, write_frames
 from benchmarks.figure import figure
 from benchmarks.measure import steady
-from benchmarks.plans import FULL, QUICK
+from benchmarks.plans import FULL, QUICK, WHOLE
 from benchmarks.processes import Process
 from benchmarks.report import BEGIN, END, generated, write_page
 from benchmarks.torchrod_path import TorchrodPeer, kernel_seconds
 from benchmarks.worker import Worker, timed
 
 import torchrod
-from torchrod import fast
+from torchrod import Estimate, fast
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -42,7 +42,7 @@ def canned() -> dict:
         },
         "iteration": {name: {b: t * (1 + 20 / int(b)) for b in batches} for name, t in at.items()} | {"scipy": {"1": 1e-2}},
         "growth": {w: {"torchrod": {str(v): 1e-6 * v for v in getattr(FULL, w)}} for w in ("steps", "markers", "loads")},
-        "linear": {"torchrod": {str(b): 4e-6 for b in FULL.linear}},
+        "linear": {name: {str(b): 4e-6 for b in FULL.linear} for name in ("torchrod", WHOLE)},
         "cores": {"torchrod": {"1": 8e-6, "2": 4e-6}},
         "memory": {"256": {"peak": 6e8, "before": 5e8, "seconds": 0.1}, "65536": {"peak": 9e8, "before": 5e8, "seconds": 10.0}},
         "command_line": {"command_s": 3.0, "import_s": 1.5},
@@ -83,10 +83,14 @@ def test_ratios_and_bars():
     assert met["one frame, 99 % point / median"] is False
     assert met["the command line on one shape, cold process"] is True
     assert met["peak memory (batch 65536)"] is True
-    linear = "time per sample, batches 256 to 65536: largest / smallest"
-    assert met[linear] is True
-    data["linear"]["torchrod"]["4096"] *= 1.11
-    assert {bar["what"]: bar["met"] for bar in bars(data)}[linear] is False
+    lines = {"torchrod": "an iteration's time per sample, batches 256 to 65536"}
+    lines[WHOLE] = "a whole estimate's time per sample, batches 1024 to 65536"
+    data["linear"][WHOLE]["256"] *= 2  # what it costs once
+    for path, line in lines.items():
+        assert met[f"{line}: largest / smallest"] is True
+        assert {bar["what"]: bar["met"] for bar in bars(data)}[f"{line}: largest / smallest"] is True
+        data["linear"][path]["4096"] *= 1.11
+        assert {bar["what"]: bar["met"] for bar in bars(data)}[f"{line}: largest / smallest"] is False
 
 
 def test_a_machine_that_is_slower_for_a_while_is_so_for_all():
@@ -101,6 +105,8 @@ def test_a_share_of_work_is_the_same_in_batches_of_every_size(folder, monkeypatc
     monkeypatch.setattr("benchmarks.worker.clocked", lambda once: calls.append(once()) or 0.5)
     assert worker.share(path, 16, 64)["seconds"] == 2.0 and len(calls) == 4
     assert worker.share(path, 64, 64)["seconds"] == 0.5
+    assert worker.share(str(write(STUDY, folder)), 32, 64, whole=True)["seconds"] == 1.0
+    assert isinstance(calls[-1], Estimate) and len(calls[-1].status) == 32
 
 
 def test_what_was_not_measured_is_said():

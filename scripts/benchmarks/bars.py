@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from .plans import SHOWN
+from .plans import SHOWN, WHOLE
 
 OF_NUMBA, OF_JAX = 0.6, 0.05
 COLD, WARM = 5000, 10000  # whole estimates a second
@@ -12,6 +12,7 @@ FRAME, TAIL = 3e-3, 2.0  # s; the 99 % point over the median
 COMMAND, BEYOND = 1.5, 1.0  # times `import torch`, plus s
 PEAK = 1.5e9  # bytes
 LINEAR = 1.1  # time per sample, largest over smallest
+LARGE = 1024  # samples, from where on what an estimate costs once, whatever its size, no longer counts
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,10 @@ def _memory(data: dict[str, Any]) -> list[Bar]:
     """Peak memory and linear time."""
     batch, peak = max(((batch, row["peak"]) for batch, row in data["memory"].items()), key=lambda pair: pair[1])
     found = [Bar(f"peak memory (batch {batch})", f"{peak / 1e9:.2f} GB", f"< {PEAK / 1e9:g} GB", peak, peak < PEAK)]
-    times = data["linear"]["torchrod"]
-    value = max(times.values()) / min(times.values())
-    what = f"time per sample, batches {min(times, key=int)} to {max(times, key=int)}: largest / smallest"
-    return [*found, Bar(what, f"{value:.2f}", f"<= {LINEAR:g}", value, value <= LINEAR)]
+    for path, what in (("torchrod", "an iteration"), (WHOLE, "a whole estimate")):
+        least = 0 if path == "torchrod" else LARGE
+        times = {int(batch): seconds for batch, seconds in data["linear"][path].items() if int(batch) >= least}
+        value = max(times.values()) / min(times.values())
+        what = f"{what}'s time per sample, batches {min(times)} to {max(times)}: largest / smallest"
+        found.append(Bar(what, f"{value:.2f}", f"<= {LINEAR:g}", value, value <= LINEAR))
+    return found

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from .cases import ITERATION, STUDY, write, write_frames
-from .plans import Plan
+from .plans import WHOLE, Plan
 from .processes import TORCHROD, Process
 
 FLOP = 0.37e6  # of one iteration of the base case: as the task of this benchmark states it, not counted here
@@ -99,20 +99,28 @@ def growth(processes: dict[str, Process], plan: Plan, folder: Path, progress: Pr
 
 
 def linearity(processes: dict[str, Process], plan: Plan, folder: Path, progress: Progress) -> dict[str, dict[str, float]]:
-    """Seconds per sample and iteration, by path and batch: every batch does the same work in turn, round by round.
+    """Seconds per sample, of an iteration and of torchrod's whole estimates, by path and batch.
 
-    The fastest of several calls, which serves elsewhere, would favour short ones: they fit between two disturbances. Each time is
-    taken over the mean of its round, because a machine that is slower for a minute is so for all; then the median over the rounds.
+    Every batch does the same work in turn, round by round. The fastest of several calls, which serves elsewhere, would favour short
+    ones: they fit between two disturbances. Each time is taken over the mean of its round, because a machine that is slower for a
+    minute is so for all; then the median over the rounds.
     """
-    able = {name: process for name, process in processes.items() if name in ("torchrod", "numba")}
-    data, taken = str(write(ITERATION, folder)), {name: {str(batch): [] for batch in plan.linear} for name in able}
-    for k in range(plan.linear_rounds):
+    found = {}
+    for name in (name for name in ("torchrod", "numba") if name in processes):
+        found[name] = _linear(processes[name], str(write(ITERATION, folder)), plan, plan.linear_rounds, progress)
+    found[WHOLE] = _linear(processes["torchrod"], str(write(STUDY, folder)), plan, plan.linear_rounds_whole, progress, whole=True)
+    return found
+
+
+def _linear(process: Process, data: str, plan: Plan, rounds: int, progress: Progress, **what: bool) -> dict[str, float]:
+    """Of one path, by batch."""
+    taken: dict[str, list[float]] = {str(batch): [] for batch in plan.linear}
+    for k in range(rounds):
         progress(f"the same work in batches of every size, round {k + 1}")
         for batch in plan.linear:
-            for name, process in able.items():
-                answer = process.ask("share", data=data, batch=batch, samples=plan.linear_samples)
-                taken[name][str(batch)].append(answer["seconds"] / plan.linear_samples)
-    return {name: steady(of) for name, of in taken.items()}
+            answer = process.ask("share", data=data, batch=batch, samples=plan.linear_samples, **what)
+            taken[str(batch)].append(answer["seconds"] / plan.linear_samples)
+    return steady(taken)
 
 
 def steady(taken: dict[str, list[float]]) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 SHOWN = (256, 4096)  # the batches of the bars
+WHOLE = "torchrod, whole estimates"  # beside iterations, where time is compared over batches
 
 
 @dataclass(frozen=True)
@@ -12,7 +13,7 @@ class Plan:
     rounds: how often every path is asked in turn; budget: seconds that a timing takes. largest: the largest batch of a path that is
     slow. growing: the paths whose growth is measured, at `growth_batch` samples. estimates: how many whole estimates of a path are
     timed at once, "" for the others. linear: batches whose time per sample is compared, over `linear_samples` samples each, in
-    turn, `linear_rounds` times.
+    turn, `linear_rounds` times, or `linear_rounds_whole` times for whole estimates.
     """
 
     batches: tuple[int, ...] = (1, 16, 256, 1024, 4096, 16384, 65536)
@@ -28,6 +29,7 @@ class Plan:
     linear: tuple[int, ...] = (256, 1024, 4096, 16384, 65536)
     linear_samples: int = 65536
     linear_rounds: int = 11
+    linear_rounds_whole: int = 5
     estimates: dict[str, int] = field(default_factory=lambda: {"torchrod, eager": 256, "scipy": 4, "": 4096})
     memory: tuple[int, ...] = (256, 4096, 65536)
     frames: int = 400
@@ -53,6 +55,7 @@ QUICK = Plan(
     linear=(256, 1024, 4096),
     linear_samples=4096,
     linear_rounds=5,
+    linear_rounds_whole=3,
     estimates={"torchrod, eager": 0, "scipy": 1, "": 1024},
     memory=(256, 1024),
     frames=120,

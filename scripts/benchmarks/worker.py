@@ -58,9 +58,12 @@ class Worker:
         found = timed(once, budget, before=as_given)
         return {name: value for name, value in found.items() if name != "value"}
 
-    def share(self, data: str, batch: int, samples: int) -> dict[str, Any]:
-        """Seconds of an iteration of so many samples in calls of `batch`, all calls together: no batch may pick its best moment."""
-        once, as_given = self._iteration(data, batch)
+    def share(self, data: str, batch: int, samples: int, whole: bool = False) -> dict[str, Any]:
+        """Seconds of so many samples in calls of `batch`, all calls together: no batch may pick its best moment.
+
+        Of an iteration, or (whole) of the estimate from a cold start.
+        """
+        once, as_given = self._estimate(data, batch) if whole else self._iteration(data, batch)
         as_given()
         once()
         seconds = 0.0
@@ -83,6 +86,12 @@ class Worker:
                 np.copyto(a, b)
 
         return lambda: peer.iterate(*state, positions), as_given
+
+    def _estimate(self, data: str, batch: int) -> tuple[Callable[[], object], Callable[[], None]]:
+        """A whole estimate of the batch, which changes nothing that is to be put back."""
+        peer, arrays = self.case(data)
+        positions = repeated(arrays["positions"], batch)
+        return lambda: peer.fitted("cold", positions), lambda: None
 
     def estimate(self, data: str, batch: int, budget: float, start: str = "cold") -> dict[str, Any]:
         """Seconds of whole estimates of the batch, and the share of torchrod's that is not spent in its kernel."""
