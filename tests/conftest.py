@@ -16,7 +16,7 @@ def pytest_collection_modifyitems(items):
     """Without the kernel a fit takes hundreds of times longer: tests of many of them would take hours."""
     if os.environ.get("TORCHROD_EVERY") or fast.library(wait=True) is not None:
         return
-    reason = "no kernel here, and its fits take minutes by the torch path; TORCHROD_EVERY=1 runs it all the same"
+    reason = "no kernel here, and this takes minutes by the torch path; TORCHROD_EVERY=1 runs it all the same"
     for item in items:
         if item.get_closest_marker("many_fits"):
             item.add_marker(pytest.mark.skip(reason=reason))

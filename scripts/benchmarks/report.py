@@ -123,7 +123,7 @@ def generated(data: dict[str, Any], options: str) -> str:
         "",
         *ratio_table(data),
         "",
-        "The same samples in calls of every size, in turn (above: the fastest call), an iteration and a whole estimate from a cold start:",
+        "The same samples in calls of every size, in turn (above: the fastest call), iterations and cold estimates:",
     ]
     lines += ["", *times_table("batch", data["linear"]), "", "Growth, microseconds per sample:"]
     for what, by_path in data["growth"].items():
