@@ -17,7 +17,6 @@ from torch import Tensor
 from .grid import DEFAULT_STEPS
 from .lie import rotate
 from .loads import Load
-from .precision import as_float64
 from .robot import Robot
 from .statics import Equilibrium, solve_shape
 from .status import Status
@@ -86,7 +85,6 @@ def solve_displacement(
     B, T = displacement.shape
     if len(robot.tendons) != T or not T:
         raise ValueError(f"{T} displacements for {len(robot.tendons)} tendons; give one per tendon")
-    displacement, outputs = as_float64(displacement), as_float64(outputs)
     # The load cells' offsets belong to readings; here the unknowns are the tensions themselves.
     robot = replace(robot, tendons=Tendons(tuple(replace(t, tension_offset=0.0) for t in robot.tendons.tendons)))
     stations = _stations(robot)

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from .estimator import Settings, estimate
 from .measurement import Markers, Model
-from .precision import DTYPE
+from .precision import as_float64
 from .result import Estimate
 from .starts import Start, StartRule, cold_start
 from .warmstart import find_warm_start
@@ -33,7 +33,7 @@ class Estimator:
         settings: Settings | None = None,
     ):
         self.model, self.noise = model, noise
-        self.s, self.offsets = s.to(DTYPE), None if offsets is None else offsets.to(DTYPE)  # once, not frame by frame
+        self.s, self.offsets = as_float64(s), as_float64(offsets)  # once, not frame by frame
         self.settings = settings or Settings()
         self._first: StartRule = find_warm_start(model) or cold_start
         self._last: Float[Tensor, "1 n"] | None = None

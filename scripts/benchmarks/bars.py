@@ -12,7 +12,7 @@ FRAME, TAIL = 3e-3, 2.0  # s; the 99 % point over the median
 COMMAND, BEYOND = 1.5, 1.0  # times `import torch`, plus s
 PEAK = 1.5e9  # bytes
 LINEAR = 1.1  # time per sample, largest over smallest
-LARGE = 1024  # samples, from where on what an estimate costs once, whatever its size, no longer counts
+LARGE = 1024  # samples: in smaller calls what an estimate costs once, whatever its size, is a third of the time
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,11 @@ def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
     ]
 
 
-def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
+def _message(estimate: Estimate, diagnosis: Diagnosis | None, b: int) -> str:
+    return f"{estimate.message(b)} {'' if diagnosis is None else diagnosis.message(b)}".rstrip()
+
+
+def result_record(estimate: Estimate, b: int, sample: str, diagnosis: Diagnosis | None = None) -> dict[str, object]:
     """One sample's entry of RESULT.json."""
     wrench = [plain(v) for v in estimate.base_wrench[b].tolist()]
     record: dict[str, object] = {
@@ -59,7 +63,7 @@ def result_record(estimate: Estimate, b: int, sample: str) -> dict[str, object]:
         else sample,
         "status": Status(int(estimate.status[b])).label,
         "accepted": bool(estimate.accepted[b]),
-        "message": estimate.message(b),
+        "message": _message(estimate, diagnosis, b),
         "iterations": int(estimate.iterations[b]),
         "restarts": int(estimate.restarts[b]),
         "warm_started": bool(estimate.warm_started[b]),
@@ -112,10 +116,6 @@ def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
     }
 
 
-def _message(estimate: Estimate, diagnosis: Diagnosis | None, b: int) -> str:
-    return f"{estimate.message(b)} {'' if diagnosis is None else diagnosis.message(b)}".rstrip()
-
-
 def write_result(
     path: str | Path,
     estimate: Estimate,
@@ -136,12 +136,11 @@ def write_result(
     if path.suffix not in RESULT_SUFFIXES:
         raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
     if path.suffix == ".json":
-        records = [result_record(estimate, b, name) for b, name in enumerate(samples)]
+        records = [result_record(estimate, b, name, diagnosis) for b, name in enumerate(samples)]
         for b, record in enumerate(records if evidence is not None else ()):
             record["evidence"] = _evidence(evidence, b)  # pyright: ignore[reportArgumentType]
         for b, record in enumerate(records if diagnosis is not None else ()):
             record["suspect_markers"] = diagnosis.suspects(b)  # pyright: ignore[reportOptionalMemberAccess]
-            record["message"] = _message(estimate, diagnosis, b)
         for b, record in enumerate(records if noise is not None else ()):
             record["noise"] = {"noise_m": plain(float(noise.sigma[b])), "std_m": plain(float(noise.std[b]))}  # pyright: ignore[reportOptionalMemberAccess]
         texts = [json.dumps(record, indent=1) for record in records]
