@@ -1,5 +1,6 @@
 """What the Python interface does with tensors that are not quite what it wants."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -79,33 +80,56 @@ LOADS = {
 }
 
 
+def doubled(what: Any) -> Any:
+    """The same numbers, given in float64."""
+    tensors = {name: x for name, x in vars(what).items() if isinstance(x, torch.Tensor)}
+    return replace(what, **{name: x.double() for name, x in tensors.items()})
+
+
+def equal(a: Any, b: Any) -> bool:
+    """Every tensor of two answers, to the bit and in float64 where it is of numbers."""
+    pairs = [(x, getattr(b, name)) for name, x in vars(a).items() if isinstance(x, torch.Tensor)]
+    return all(torch.equal(x, y) and x.dtype == y.dtype != torch.float32 for x, y in pairs)
+
+
 @pytest.mark.parametrize("kind", LOADS)
 def test_known_loads_of_single_precision(kind):
-    """Forward solves, as a user writes them who has not read that physics is done in float64."""
+    """Forward solves, as a user writes them who has not read that physics is done in float64: as if the numbers had been so."""
     torch.set_default_dtype(torch.float32)
-    load, s = LOADS[kind](), f(0.1, 0.2, 0.4)
-    rod = Rod.circular(0.4, 1.4e-3, 207e9, 79e9, mass_per_length=0.012)
-    robot = Robot(rod, Tendons((Tendon.straight(0.01, 0.0, 0.4),)), f(0.0, -9.81, 0.0))
-    solved = solve_shape(robot, (load,), f([1.0]), s, 1)
-    assert solved.p.dtype == torch.float64 and solved.status == 0
-    pulled = solve_displacement(robot, (load,), f([1e-3]), s)
-    assert pulled.equilibrium.p.dtype == torch.float64 and pulled.equilibrium.status == 0
-    again = shape_from_base(robot, (load,), solved.base_wrench.float(), f([1.0]), s, 40)
-    assert (again.p - solved.p).abs().max() < 1e-5  # what float32 leaves of the base wrench
+    given = LOADS[kind]()
+    assert equal(given, doubled(given))
+    s, tension, gravity, K = f(0.1, 0.2, 0.4), f([1.0]), f(0.0, -9.81, 0.0), torch.diag(f(1e5, 1e5, 3e5))
+    bending = 1e-7 * K
+    found = []
+    for to in (torch.float32, torch.float64):
+        load = given if to == torch.float32 else doubled(given)
+        rod = Rod.from_stiffness(0.4, K.to(to), bending.to(to), 0.012)
+        robot = Robot(rod, Tendons((Tendon.straight(0.01, 0.0, 0.4),)), gravity.to(to))
+        assert equal(rod, doubled(rod)) and equal(robot, doubled(robot))
+        solved = solve_shape(robot, (load,), tension.to(to), s.to(to), 1)
+        pulled = solve_displacement(robot, (load,), f([1e-3]).to(to), s.to(to)).equilibrium
+        again = shape_from_base(robot, (load,), solved.base_wrench.float().to(to), tension.to(to), s.to(to), 40)
+        assert solved.status == pulled.status == 0
+        found.append((solved, pulled, again))
+    assert all(equal(single, double) for single, double in zip(*found, strict=True))
 
 
 def test_bounds_and_placement_of_single_precision():
     torch.set_default_dtype(torch.float32)
     robot = Robot(Rod.circular(0.4, 1.4e-3, 207e9, 79e9), Tendons((Tendon.straight(0.01, 0.0, 0.4),)))
-    s, tension = torch.linspace(0.02, 0.4, 20), f(1.0)
-    found = bounds(robot, s, 1e-3, 0.5, f(0.2, 0.3), tension, directions=2)
-    same = bounds(robot, s.double(), 1e-3, 0.5, f(0.2, 0.3).double(), tension.double(), directions=2)
-    assert torch.equal(found.location_std, same.location_std)
-    markers, force, where = Markers(s, torch.zeros(1, 20, 3), tension=f([1.0])), f([0.5, 0.0]), f(0.3)
-    wrench = solve_shape(robot, (PointForces(f([[0.5, 0.0, 0.0]]), f([0.3])),), f([1.0]), s, 1).base_wrench
-    single, double = (load_bound(robot, markers, force.to(t), where.to(t), wrench, 1e-3) for t in (torch.float32, torch.float64))
-    assert torch.equal(single[0], double[0])
-    assert place(robot, 4, 1e-3, 0.5, tension, directions=2).s.dtype == torch.float64
+    s, tension, places, force, where = torch.linspace(0.02, 0.4, 20), f(1.0), f(0.2, 0.3), f([0.5, 0.0]), f(0.3)
+    found = []
+    for to in (torch.float32, torch.float64):
+        bound = bounds(robot, s.to(to), 1e-3, 0.5, places.to(to), tension.to(to), directions=2)
+        push, markers = (
+            PointForces(f([[0.5, 0.0, 0.0]]).to(to), f([0.3]).to(to)),
+            Markers(s.to(to), torch.zeros(1, 20, 3), tension=f([1.0])),
+        )
+        wrench = solve_shape(robot, (push,), f([1.0]).to(to), s.to(to), 1).base_wrench.float().to(to)
+        std = load_bound(robot, markers, force.to(to), where.to(to), wrench, 1e-3)
+        found.append((bound, place(robot, 4, 1e-3, 0.5, tension.to(to), directions=2), std))
+    assert all(equal(single, double) for single, double in zip(found[0][:2], found[1][:2], strict=True))
+    assert all(torch.equal(single, double) for single, double in zip(found[0][2], found[1][2], strict=True))
 
 
 @pytest.mark.parametrize(
