@@ -236,7 +236,6 @@ def bounds(
     Errors: ValueError for markers, force, noise or tensions that do not fit the robot.
     """
     check(robot, s, noise, force, tension)
-    s, tension = as_float64(s), as_float64(tension)
     at = places(robot, PLACES) if locations is None else as_float64(locations)
     angle, e = around(directions)
     model, K = push_model(robot, registration, steps), len(at)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .grid import DEFAULT_STEPS
 from .observability import around, check, covariance, held, places, push_model, pushed, seen_by, sensitivity
-from .precision import DTYPE, as_float64
+from .precision import DTYPE
 from .robot import Robot
 
 CANDIDATES = 50  # evenly spaced along the rod, beside those of the even layout; the last is the tip
@@ -131,7 +131,7 @@ def place(
     noise: standard deviation of a marker coordinate (m). tension: readings (N). gap: least distance of two markers (m; 2 % of L, or
     the even spacing if that is less). Starts from the even layout and is never worse. Errors: ValueError for what does not fit.
     """
-    L, tension = robot.rod.length, as_float64(tension)
+    L = robot.rod.length
     even = even_layout(robot, count)
     check(robot, even, noise, force, tension)
     nearest = FROM * L if nearest is None else nearest

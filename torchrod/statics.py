@@ -108,7 +108,7 @@ def shape_from_base(
 
     differentiable=False takes the compiled march where it serves, for alpha (B, 6) outside of any transform.
     """
-    alpha, tension, outputs = as_float64(alpha), as_float64(tension), as_float64(outputs)
+    alpha, outputs = as_float64(alpha), as_float64(outputs)
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
@@ -227,7 +227,7 @@ def solve_shape(
     point load off the rod, INVALID.
     Source: docs/model.md.
     """
-    tension, outputs, q_tip = as_float64(tension), as_float64(outputs), as_float64(q_tip)
+    outputs, q_tip = as_float64(outputs), as_float64(q_tip)
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
