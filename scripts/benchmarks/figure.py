@@ -56,11 +56,13 @@ def _draw(axes: Axes, by_path: dict[str, dict[str, float]]) -> None:
 
 
 def _floors(axes: Axes, floor: dict[str, float]) -> None:
-    """Dashed, with the name at the right."""
+    """Dashed, with the name below it, where no curve runs."""
     cores, seconds = max(floor.items(), key=lambda item: int(item[0]))
     axes.axhline(MICRO * seconds, color="#444444", ls="--", lw=1.2)
     words = f"floor: 0.37 Mflop at the dgemm rate, {cores} cores"
-    axes.annotate(words, (0.02, MICRO * seconds), xycoords=("axes fraction", "data"), xytext=(0, 4), textcoords="offset points")
+    place = {"xycoords": ("axes fraction", "data"), "xytext": (0, -4), "textcoords": "offset points", "va": "top"}
+    axes.annotate(words, (0.02, MICRO * seconds), **place)
+    axes.set_ylim(bottom=0.5 * min(MICRO * seconds, axes.get_ylim()[0]))
 
 
 def figure(data: dict[str, Any], path: Path) -> None:
