@@ -28,6 +28,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.lie import move
+from torchrod.measurement import TIP_EXACT
 from torchrod.prepared import Prepared
 from torchrod.tendons import Tendon, Tendons
 
@@ -105,6 +106,29 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     assert close(prepared.cost(x), expected.cost.sum(-1) + (precision * (mean - x) ** 2).sum(-1))
 
 
+def test_the_covariance():
+    """Prepared.posterior against ekf.posterior, also where the normal equations have no inverse or are not finite."""
+    model, markers, x = case(steel_rod(), GaussianCoordinates(2, 0.4, 1.0), True, "force")
+    prepared = Prepared(model, markers, model.weights(markers, 1e-3))
+    sums = prepared.sums(x)
+    sums.A[1] *= -1.0
+    sums.A[2, 0, 3, 3] = torch.inf
+    sums.A[3, 1, 5, 2] = sums.A[3, 1, 2, 5] = torch.nan
+    normal, prior = prepared.normal(sums), model.prior()
+    A = normal.exact(TIP_EXACT).whole(x, *prior)[0]
+    exact = ekf.posterior(A)
+    covariance, cost = prepared.posterior(sums, x)
+    assert torch.allclose(cost, normal.whole(x, *prior)[2], rtol=1e-12)
+    sound = torch.tensor([True, False, False, False, True])
+    assert torch.isnan(exact[~sound]).all()
+    assert torch.isnan(covariance[~sound]).all()
+    scale, std = (C[sound].diagonal(dim1=1, dim2=2).sqrt() for C in (A, exact))
+    condition = torch.linalg.cond(A[sound] / (scale.unsqueeze(-1) * scale.unsqueeze(-2)))
+    error = (covariance - exact)[sound].abs() / (std.unsqueeze(-1) * std.unsqueeze(-2))
+    assert (error.amax((1, 2)) <= 1e-15 * condition).all()
+    assert torch.equal(covariance[sound], covariance[sound].mT)
+
+
 def test_one_iteration_of_the_filter():
     """fast.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
     model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
@@ -112,6 +136,7 @@ def test_one_iteration_of_the_filter():
     fitted = estimate(model, markers, 0.1).x
     x[0], x[3, 0] = fitted[0], torch.nan
     sums = fast.Sums.room(B, model.size, 3)
+    sums.A.fill_(torch.nan)
     Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
     start = ekf.Iterate(
         x.clone(), 0.2 * Sigma0, 0.9 * x.nan_to_num(1.0), T([9.0, 0.1, torch.inf, 1.0, 2.0]), torch.zeros(B, dtype=torch.bool)

@@ -20,11 +20,12 @@ from .estimator import Settings
 from .grid import DEFAULT_STEPS
 from .measurement import Markers, Model
 from .precision import DTYPE
-from .result import ACCEPT, Z95
+from .result import Z95
 from .robot import Robot
 from .status import Status
 from .tendons import Tendons
 from .unloaded import MASS, OFFSET, PRIOR, STIFFNESS, Trial, UnloadedShapes
+from .verdict import ACCEPT
 
 RETREATS = 5  # halvings of a step that loses samples, before they are given up
 HARDLY = 0.5  # a standard deviation of theta above this determines nothing

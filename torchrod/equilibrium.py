@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -9,8 +10,10 @@ from torch import Tensor
 
 from . import fast
 from .coordinates import GaussianCoordinates
+from .kept import versions
 from .measurement import Markers, Model
 from .prepared import Prepared, family_of, served
+from .robot import Robot
 from .statics import LOAD_PER_INCREMENT, ROUGH_TOLERANCE, solve_shape
 
 
@@ -51,11 +54,23 @@ def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: 
 
 def without_load(model: Model, markers: Markers) -> Rest:
     """The robot under its tensions and its weight alone: one forward solve where the samples are alike before the load."""
-    bare = replace(model, coordinates=GaussianCoordinates(0, model.robot.rod.length, model.robot.rod.force_scale))
-    B, alike = len(markers.positions), markers.tension is None and model.robot.gravity.ndim == 1
-    part = markers.take(torch.arange(1)) if alike else markers
-    rest = at_rest(bare, part, markers.positions.new_zeros(len(part.positions), 0))
+    if markers.tension is not None or model.robot.gravity.ndim > 1:
+        return _bare(model.robot, model.steps, markers)
+    B, now, compiled = len(markers.positions), model.robot.versions + versions(markers.s), served(model, markers.positions)
+    rest = _kept_bare(model.robot, model.steps, markers.s, now, compiled)
     return Rest(rest.wrench.expand(B, 6), rest.p.expand(B, *rest.p.shape[1:]))
+
+
+def _bare(robot: Robot, steps: int, markers: Markers) -> Rest:
+    model = Model(robot, GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale), steps=steps)
+    return at_rest(model, markers, markers.positions.new_zeros(len(markers.positions), 0))
+
+
+@lru_cache(maxsize=32)
+@torch.inference_mode(False)  # it outlives the call
+def _kept_bare(robot: Robot, steps: int, s: Float[Tensor, " P"], now: tuple[int, ...], compiled: bool) -> Rest:
+    """The same for the next shapes, unless a tensor of the robot or s has been changed since, or another path serves."""
+    return _bare(robot, steps, Markers(s, s.new_zeros(1, len(s), 3)))
 
 
 def _increments(model: Model) -> int:

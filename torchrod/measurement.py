@@ -18,6 +18,7 @@ from torch.func import jvp, vmap
 from .coordinates import LoadCoordinates
 from .grid import DEFAULT_STEPS
 from .jacobian import forward_jacobian
+from .kept import kept
 from .lie import move, rotate, unrotate
 from .loads import LoadIntegrals, total
 from .march import march_linearized
@@ -56,8 +57,9 @@ class Markers(Float64):
         """What does not belong together, in one sentence; None where all does."""
         P, B = self.s.numel(), len(self.positions)
         shapes = {"s": (P,), "positions": (B, P, 3), "offsets": (P, 3), "tension": (B, None), "sigma": (B,)}
-        for name, value in vars(self).items():
-            wanted, found = shapes[name], () if value is None else tuple(value.shape)
+        for name, wanted in shapes.items():
+            value = getattr(self, name)
+            found = () if value is None else tuple(value.shape)
             fits = len(found) == len(wanted) and all(w in (None, n) for w, n in zip(wanted, found, strict=True))
             if value is not None and not fits:
                 shown = str(wanted).replace("None", "tendons")
@@ -67,7 +69,7 @@ class Markers(Float64):
     @property
     def present(self) -> Bool[Tensor, "B P"]:
         """Which markers were seen."""
-        return torch.isfinite(self.positions).all(-1)
+        return kept(self, "_present", self.positions, lambda positions: torch.isfinite(positions).all(-1))
 
     def take(self, index: Int[Tensor, " b"]) -> "Markers":
         """The samples of an index."""

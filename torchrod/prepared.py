@@ -18,9 +18,9 @@ from . import ekf, fast
 from .coordinates import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
 from .grid import Grid
 from .jacobian import forward_jacobian
-from .kept import version
+from .kept import versions
 from .loads import total
-from .measurement import TURN_SCALE, Markers, Model
+from .measurement import TIP_EXACT, TURN_SCALE, Markers, Model
 from .statics import beyond_tip, grid_for, stage_table
 from .step import Section
 
@@ -154,7 +154,7 @@ def _layout(
 
 
 @lru_cache(maxsize=32)
-def _kept_layout(model: Model, s: Tensor, offsets: Tensor | None, versions: tuple[int, ...]) -> Layout:
+def _kept_layout(model: Model, s: Tensor, offsets: Tensor | None, now: tuple[int, ...]) -> Layout:
     return _layout(model, s, offsets)
 
 
@@ -162,9 +162,8 @@ def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, 
     """Everything of torchrod.fast.fitting. The layout is kept for the next shapes, unless a tensor in it has been changed since."""
     robot = model.robot
     if x is None:
-        held = (markers.s, markers.offsets, robot.gravity, *(v for v in vars(robot.rod).values() if isinstance(v, Tensor)))
-        versions = tuple(version(v) for v in held if v is not None)
-        layout = _kept_layout(model, markers.s, markers.offsets, versions)
+        now = robot.versions + versions(markers.s, markers.offsets)
+        layout = _kept_layout(model, markers.s, markers.offsets, now)
     else:
         layout = _layout(model, markers.s, markers.offsets, x)
     if layout.shared is not None:
@@ -244,6 +243,14 @@ class Prepared:
     def normal(self, sums: fast.Sums) -> ekf.Normal:
         """As torchrod.ekf has them."""
         return ekf.Normal(sums.A, sums.g, sums.cost, (self.w[:, :-6] > 0).sum(-1))
+
+    def posterior(self, sums: fast.Sums, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
+        """From the sums at x: the covariance, with a tip residual TIP_EXACT times as stiff, and the cost of (3) with the prior."""
+        if self.compiled:
+            return fast.posterior_now(sums, x, *self._prior, TIP_EXACT**2)
+        normal = self.normal(sums)
+        A, _, _ = normal.exact(TIP_EXACT).whole(x, *self._prior)
+        return ekf.posterior(A), normal.whole(x, *self._prior)[2]
 
     @property
     def at_once(self) -> bool:

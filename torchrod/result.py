@@ -1,26 +1,23 @@
 """The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache, partial
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.special import chdtri
 from torch import Tensor
 
-from . import ekf
 from .coordinates import GaussianCoordinates
 from .fast import Sums
 from .fit import Fit
 from .jacobian import pointwise_jacobian
-from .measurement import TIP_EXACT, Model
+from .measurement import Model
 from .prepared import Prepared
 from .profile import Profile
 from .status import Learned, Status
+from .verdict import limit, verdict
 
 Z95 = 1.959964  # of the standard normal distribution
-ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,7 @@ class Estimate:
             return status.message
         chi2, dof = float(self.chi2[sample]), int(self.dof[sample])
         reason = f"chi2 = {chi2:.3g} for {dof} degrees of freedom"
-        if chi2 < _limit(dof):
+        if chi2 < limit(dof):
             reason = "most markers were left aside, or neighbouring residuals are too much alike for noise"
         remedy = "allow more contacts, state more noise, or check tensions, gravity and registration"
         return f"Converged, but {reason}: the model does not explain the markers; {remedy}."
@@ -224,28 +221,11 @@ def _tensions(
     return tension, model.tension_std * variance.clamp(min=0).sqrt()
 
 
-@lru_cache(maxsize=4096)
-def _limit(dof: int) -> float:
-    """The 99.9 % point of chi^2."""
-    return float(chdtri(max(dof, 1), 1 - ACCEPT))
-
-
-def _verdict(
-    prepared: Prepared, sums: Sums, cost: Float[Tensor, " B"]
-) -> tuple[Bool[Tensor, "B P"], Float[Tensor, " B"], Int[Tensor, " B"], Bool[Tensor, " B"]]:
-    """outlier, chi2 and dof of Estimate, and whether the fit explains the markers: one that leaves most aside does not."""
-    model, present = prepared.model, prepared.markers.present
-    square = (prepared.w * sums.r**2)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
-    outlier = present & (square > _limit(3)) if math.isfinite(prepared.nu) else torch.zeros_like(present)
-    inside = present & ~outlier
-    chi2 = cost - sums.cost[:, 0] + (square * inside).sum(-1)
-    dof = 3 * inside.sum(-1) + 6 + model.coordinates.informative_priors + model.tension_size - model.size
-    limit = torch.tensor([_limit(k) for k in dof.tolist()], dtype=cost.dtype)
-    return outlier, chi2, dof, (chi2 < limit) & (2 * inside.sum(-1) > present.sum(-1))
-
-
-def _where(mask: Bool[Tensor, " B"], value: Tensor) -> Tensor:
-    return torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
+def _only(mask: Bool[Tensor, " B"]) -> Callable[[Tensor], Tensor]:
+    """What leaves the samples of a mask as they are and fills the others with NaN."""
+    if bool(mask.all()):  # as a rule
+        return Tensor.contiguous
+    return lambda value: torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
 
 
 def make_estimate(
@@ -259,18 +239,16 @@ def make_estimate(
 ) -> Estimate:
     """Assemble the result from x and the sums where the model was last evaluated; an invalid sample holds NaN throughout."""
     model, markers = prepared.model, prepared.markers
-    normal, prior = prepared.normal(sums), model.prior()
-    cost = normal.whole(evaluated, *prior)[2]
+    covariance, cost = prepared.posterior(sums, evaluated)
     valid = (status != int(Status.INVALID)) & torch.isfinite(cost)
     status = torch.where(valid, status, int(Status.INVALID))
 
-    kept = partial(_where, valid)
-    settled = partial(_where, status == int(Status.CONVERGED))  # elsewhere a spread would look like knowledge
+    converged = status == int(Status.CONVERGED)
+    kept, settled = _only(valid), _only(converged)  # elsewhere a spread would look like knowledge
     gamma, zeta, alpha = model.split(x)
     report = model.coordinates.describe(gamma)
-    covariance = ekf.posterior(normal.exact(TIP_EXACT).whole(evaluated, *prior)[0])
     free = _tensions(prepared, x, covariance)
-    outlier, chi2, dof, explained = _verdict(prepared, sums, cost)
+    outlier, chi2, dof, explained = verdict(prepared, sums, cost)
     return Estimate(
         x=kept(x),
         covariance=settled(covariance),
@@ -291,7 +269,7 @@ def make_estimate(
         cost=kept(cost),
         chi2=kept(chi2),
         dof=dof,
-        accepted=explained & (status == int(Status.CONVERGED)),
+        accepted=explained & converged,
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,

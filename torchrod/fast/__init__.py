@@ -13,6 +13,7 @@ from .fitting import (
     measure_now,
     normal_equations,
     normal_equations_now,
+    posterior_now,
     seconds,
 )
 from .marching import known, march_linearized, with_rows
@@ -38,6 +39,7 @@ __all__ = [
     "measured",
     "normal_equations",
     "normal_equations_now",
+    "posterior_now",
     "seconds",
     "with_rows",
 ]

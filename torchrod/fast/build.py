@@ -44,6 +44,7 @@ else
 fi
 """
 _starting = threading.Lock()
+_loaded: list[ctypes.CDLL] = []  # the library, once it is there: to look for its file takes as long as to fit a few samples
 
 
 def _unlock() -> None:
@@ -205,6 +206,8 @@ def library(wait: bool = False) -> ctypes.CDLL | None:
     """
     if os.environ.get("TORCHROD_FAST", "1") == "0":
         return None
+    if _loaded:
+        return _loaded[0]
     try:
         found = _found(wait)
     except OSError as error:
@@ -212,6 +215,8 @@ def library(wait: bool = False) -> ctypes.CDLL | None:
     if isinstance(found, str):
         _say_once(found)
         return None
+    if found is not None:
+        _loaded.append(found)
     return found
 
 

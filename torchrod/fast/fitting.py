@@ -153,6 +153,19 @@ def cost_now(x: Float[Tensor, "B n"], mean: Float[Tensor, " n"], precision: Floa
     return cost
 
 
+def posterior_now(
+    sums: "Sums", x: Float[Tensor, "B n"], mean: Float[Tensor, " n"], precision: Float[Tensor, " n"], stiffer: float
+) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
+    """From the sums at x: the covariance, with the tip residual's weight multiplied by `stiffer`, and the cost with the prior's."""
+    (B, n), x, mean, precision = x.shape, x.contiguous(), mean.contiguous(), precision.contiguous()
+    covariance, cost, structure = x.new_empty(B, n, n), x.new_empty(B), CSums()
+    fill(structure, vars(sums), {})
+    given = (address(x, "x"), address(mean, "mean"), address(precision, "precision"), ctypes.c_int64(n), ctypes.c_double(stiffer))
+    out = (address(covariance, "covariance"), address(cost, "cost"))
+    run("torchrod_posterior", B, ctypes.byref(structure), *given, ctypes.c_int64(B), *out)
+    return covariance, cost
+
+
 def balance_now(
     x: Float[Tensor, "B n"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float, fit: Fit, P: int
 ) -> tuple[Float[Tensor, "B 6"], Float[Tensor, " B"], Float[Tensor, "B P 3"]]:
@@ -181,9 +194,9 @@ class Sums:
 
     @classmethod
     def room(cls, B: int, n: int, P: int) -> "Sums":
-        """NaN throughout."""
+        """To be written."""
         sizes = ((B, 2, n, n), (B, 2, n), (B, 2), (B, 3 * P + 6), (B, P, 3))
-        return cls(*(torch.full(size, torch.nan, dtype=torch.float64) for size in sizes))
+        return cls(*(torch.empty(size, dtype=torch.float64) for size in sizes))
 
     def put(self, index: Int[Tensor, " b"], other: "Sums") -> None:
         """Write the samples of an index, in place."""

@@ -123,6 +123,34 @@ void torchrod_normal(const Fit* f, const double* x, int64_t count, const Sums* o
     });
 }
 
+// From sums at x (b, n): the cost (b) with the prior's, and the covariance (b, n, n) with a tip residual whose weight is multiplied by
+// `stiffer`; NaN where there is none. Prepared.posterior.
+void torchrod_posterior(const Sums* sums, const double* x, const double* mean, const double* precision, int64_t n, double stiffer,
+                        int64_t count, double* covariance, double* cost, int64_t threads) {
+    in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room&, std::vector<V>& numbers) {
+        numbers.resize(3 * n * n + n);
+        V *A = numbers.data(), *found = A + n * n, total = fetch({sums->cost, 2}, lanes, 0) + fetch({sums->cost, 2}, lanes, 1);
+        Mask sound = finite(V{});
+        for (int64_t i = 0; i < n; i++) {
+            const V off = mean[i] - fetch({x, n}, lanes, i);
+            total += precision[i] * off * off;
+            for (int64_t j = 0; j <= i; j++) {
+                const V markers = fetch({sums->A, 2 * n * n}, lanes, i * n + j);
+                const V tip = fetch({sums->A, 2 * n * n}, lanes, n * n + i * n + j);
+                A[i * n + j] = markers + stiffer * tip + (i == j ? splat(precision[i]) : V{});
+                sound &= finite(A[i * n + j]);
+            }
+        }
+        Inverse(n, A, found + n * n).whole(found);
+        for (int64_t l = 0; l < lanes.count; l++) {
+            const int64_t b = lanes.sample[l];
+            cost[b] = total[l];
+            for (int64_t k = 0; k < n * n; k++)
+                covariance[b * n * n + k] = sound[l] ? found[k][l] : std::numeric_limits<double>::quiet_NaN();
+        }
+    });
+}
+
 // One iteration of the filter for the samples in the lanes, in place; the sums of those that are done.
 static void iterate(const Fit& f, const Filter& filter, const Sums& out, const Lanes& lanes, Room& room, std::vector<V>& numbers) {
     const int64_t n = f.size;
