@@ -3,10 +3,11 @@
 import roma
 import torch
 
-from tests.robots import T, busy_robot
+from tests.robots import T, busy_robot, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, PointCoordinates, forward_jacobian
 from torchrod.jacobian import pointwise_jacobian
 from torchrod.lie import exponential, logarithm, product
+from torchrod.result import load_covariance
 
 
 def check(model: Model, markers: Markers, x: torch.Tensor) -> None:
@@ -45,7 +46,7 @@ def test_rotation_vectors_are_romas_and_smooth_at_zero():
     assert torch.allclose(J, torch.eye(3).expand_as(J), atol=1e-12)
 
 
-def test_the_slope_of_a_gaussians_report_is_its_derivative():
+def test_the_covariance_of_a_gaussians_report_goes_by_its_derivative():
     torch.manual_seed(0)
     for locations in (None, (0.1, 0.3)):
         c = GaussianCoordinates(2, 0.4, 1.3, "contact", locations)
@@ -56,7 +57,9 @@ def test_the_slope_of_a_gaussians_report_is_its_derivative():
             return torch.cat([report.force, report.location.unsqueeze(-1), report.width.unsqueeze(-1)], -1).flatten(-2)
 
         _, whole = pointwise_jacobian(described, gamma)
-        slope = c.report_slope(gamma)
-        blocks = torch.zeros(5, 2, 4, 2, c.per_load)
-        blocks[:, range(2), :, range(2)] = slope.movedim(1, 0)
-        assert torch.allclose(whole, blocks.flatten(3, 4).flatten(1, 2), rtol=1e-12, atol=1e-14)
+        x = torch.cat([gamma, torch.randn(5, 6)], -1)
+        root = torch.randn(5, c.size + 6, c.size + 6)
+        found = load_covariance(Model(steel_rod(), c), x, root @ root.mT)
+        J = whole.unflatten(1, (2, 4))
+        own = (root @ root.mT)[:, None, : c.size, : c.size]
+        assert torch.allclose(found, J @ own @ J.mT, rtol=1e-12, atol=1e-14)

@@ -187,9 +187,11 @@ def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Ten
     """Covariance of [F_x, F_y, location, width] per load, carried over from x by the derivative of `describe`."""
     c, n = model.coordinates, model.coordinates.size
     if isinstance(c, GaussianCoordinates) and n:  # a fifth of the time of a single frame
-        J = c.report_slope(x[:, :n])
+        slope = c.report_slope(x[:, :n])
         own = covariance[:, :n, :n].unflatten(2, (c.count, -1)).unflatten(1, (c.count, -1)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
-        return J @ own @ J.mT
+        if c.per_load == 3:
+            own = own[..., [0, 1, 2, 2], :][..., [0, 1, 2, 2]]  # any entry in the location's place
+        return own * (slope.unsqueeze(-1) * slope.unsqueeze(-2))
 
     def described(gamma: Float[Tensor, "... g"]) -> Float[Tensor, "... k4"]:
         report = c.describe(gamma)
@@ -221,11 +223,11 @@ def _tensions(
     return tension, model.tension_std * variance.clamp(min=0).sqrt()
 
 
-def _only(mask: Bool[Tensor, " B"]) -> Callable[[Tensor], Tensor]:
-    """What leaves the samples of a mask as they are and fills the others with NaN."""
+def _only(mask: Bool[Tensor, "..."]) -> Callable[[Tensor], Tensor]:
+    """What leaves the samples (or markers) of a mask as they are and fills the others with NaN."""
     if bool(mask.all()):  # as a rule
         return Tensor.contiguous
-    return lambda value: torch.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, torch.nan)
+    return lambda value: torch.where(mask.reshape(*mask.shape, *[1] * (value.ndim - mask.ndim)), value, torch.nan)
 
 
 def make_estimate(
@@ -262,7 +264,7 @@ def make_estimate(
         base_wrench=kept(alpha),
         registration=None if zeta is None else kept(zeta),
         centre_line=kept(sums.line),
-        residual=torch.where(markers.present.unsqueeze(-1), kept(sums.r[:, :-6].unflatten(-1, (-1, 3))), torch.nan),
+        residual=_only(markers.present)(kept(sums.r[:, :-6].unflatten(-1, (-1, 3)))),
         tension=None if free is None else kept(free[0]),
         tension_std=None if free is None else settled(free[1]),
         outlier=outlier,

@@ -32,10 +32,12 @@ def verdict(
 ) -> tuple[Bool[Tensor, "B P"], Float[Tensor, " B"], Int[Tensor, " B"], Bool[Tensor, " B"]]:
     """outlier, chi2 and dof of Estimate, and whether the fit explains the markers: one that leaves most aside does not."""
     model, present = prepared.model, prepared.markers.present
-    square = (prepared.w * sums.r**2)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
-    outlier = present & (square > limit(3)) if math.isfinite(prepared.nu) else torch.zeros_like(present)
-    inside = present & ~outlier
-    chi2 = cost - sums.cost[:, 0] + (square * inside).sum(-1)
+    outlier, inside, chi2 = torch.zeros_like(present), present, cost.clone()
+    if math.isfinite(prepared.nu):
+        square = (prepared.w * sums.r**2)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
+        outlier = present & (square > limit(3))
+        inside = present & ~outlier
+        chi2 = cost - sums.cost[:, 0] + (square * inside).sum(-1)
     dof = 3 * inside.sum(-1) + 6 + model.coordinates.informative_priors + model.tension_size - model.size
     most = 3 * present.shape[-1] + 6 + model.size
     return outlier, chi2, dof, (chi2 < _limits(most)[dof.clamp(min=0)]) & (2 * inside.sum(-1) > present.sum(-1))

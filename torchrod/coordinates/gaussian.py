@@ -111,12 +111,12 @@ class GaussianCoordinates:
             parts[1:] = [torch.where(sure, torch.logit(farther), parts[1][..., :1]), parts[1][..., 1:]]
         return torch.cat(parts, -1).flatten(-2)
 
-    def report_slope(self, gamma: Gamma) -> Float[Tensor, "... K 4 p"]:
-        """How [F_x, F_y, location, width] of a load, as described, move with its own entries of gamma: describe's derivative."""
+    def report_slope(self, gamma: Gamma) -> Float[Tensor, "... K 4"]:
+        """How each of [F_x, F_y, location, width], as described, moves with the one entry of gamma that moves it; 0: none does."""
         _, mu, c = self._split(gamma)
         force = torch.full_like(mu, self.force_scale)
-        J = torch.diag_embed(torch.stack([force, force, mu * (1 - mu / self.length), -0.5 * (2 * c) ** -0.5], -1))
-        return J if self.locations is None else J[..., [0, 1, 3]]
+        location = mu * (1 - mu / self.length) if self.locations is None else torch.zeros_like(mu)
+        return torch.stack([force, force, location, -0.5 * (2 * c) ** -0.5], -1)
 
     def _log_c(self) -> float:
         name = "contact" if self.prior_name == "none" else self.prior_name

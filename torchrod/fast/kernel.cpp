@@ -1,7 +1,7 @@
 // The library's entry points: each shares its samples among threads, in groups of W.
 
 #include "balance.h"
-#include "filter.h"
+#include "course.h"
 #include "mlp.h"
 #include "threads.h"
 
@@ -9,7 +9,7 @@ namespace {
 
 // work(lanes, room, numbers) for groups of W samples.
 template <class Work> void in_groups(int64_t count, const int64_t* index, int64_t threads, Work work) {
-    in_parts((count + W - 1) / W, 1, threads, [&](int64_t from, int64_t to) {
+    in_parts((count + W - 1) / W, threads, [&](int64_t from, int64_t to) {
         static thread_local Room room;  // its memory serves the next call, too
         static thread_local std::vector<V> numbers;
         for (int64_t g = from; g < to; g++) {
@@ -95,24 +95,7 @@ void torchrod_measure(const Fit* f, const double* x, const int64_t* index, int64
     });
 }
 
-// The normal equations of samples: markers' and tip's A (B, 2, n, n), g (B, 2, n), cost (B, 2); r (B, Z), line (B, P, 3).
-struct Sums {
-    double *A, *g, *cost, *r, *line;
-};
-
-static void keep(const Fit& f, int64_t b, int64_t lane, const Measured& m, const Normal& N, const Sums& out) {
-    const int64_t n = f.size, P = f.known.outputs - 1, Z = 3 * P + PLAIN;
-    for (int64_t part = 0; part < 2; part++) {
-        out.cost[2 * b + part] = N.cost[part][lane];
-        for (int64_t i = 0; i < n; i++) {
-            out.g[(2 * b + part) * n + i] = N.g[part][i][lane];
-            for (int64_t j = 0; j < n; j++) out.A[((2 * b + part) * n + i) * n + j] = N.A[part][i < j ? j * n + i : i * n + j][lane];
-        }
-    }
-    for (int64_t z = 0; z < Z; z++) out.r[b * Z + z] = m.h(z)[lane];
-    for (int64_t k = 0; k < 3 * P; k++) out.line[b * 3 * P + k] = m.line[k][lane];
-}
-
+// The normal equations of samples at x (b, n).
 void torchrod_normal(const Fit* f, const double* x, int64_t count, const Sums* out, int64_t threads) {
     const int64_t n = f->size;
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>& numbers) {
@@ -151,63 +134,15 @@ void torchrod_posterior(const Sums* sums, const double* x, const double* mean, c
     });
 }
 
-// One iteration of the filter for the samples in the lanes, in place; the sums of those that are done.
-static void iterate(const Fit& f, const Filter& filter, const Sums& out, const Lanes& lanes, Room& room, std::vector<V>& numbers) {
-    const int64_t n = f.size;
-    const Measured m = measure(f, lanes, [&](int64_t j) { return fetch({filter.x, n}, lanes, j); }, true, room);
-    numbers.resize(6 * n * n + 7 * n);
-    const Normal N = normal_equations(f, lanes, m, numbers.data());
-    advance(filter, lanes, n, N, numbers.data() + 2 * n * n + 2 * n);
-    for (int64_t l = 0; l < lanes.count; l++)
-        if (filter.done[lanes.sample[l]]) keep(f, lanes.sample[l], l, m, N, out);
-}
-
-// The same for the samples `index`.
+// One iteration of the filter for the samples `index`.
 void torchrod_iterate(const Fit* f, const Filter* filter, const Sums* out, const int64_t* index, int64_t count, int64_t threads) {
     in_groups(count, index, threads,
               [&](const Lanes& lanes, Room& room, std::vector<V>& numbers) { iterate(*f, *filter, *out, lanes, room, numbers); });
 }
 
-// Iterations until every sample of `index` has converged or has had `most`: by the coarse model until it is near, then by the fine
-// one. estimator.py, _step_by_step. near (B): in and out; converged, iterations (B): out.
-struct Course {
-    const Fit *coarse, *fine;
-    const Filter *rough, *filter;
-    const Sums* out;
-    int64_t most;
-    uint8_t *near, *converged;
-    int64_t* iterations;
-};
-
-static void run(const Course& c, const int64_t* index, int64_t count) {
-    std::vector<int64_t> queue[2];  // far, near
-    Room room;
-    std::vector<V> numbers;
-    for (int64_t i = count - 1; i >= 0; i--) queue[c.near[index[i]] != 0].push_back(index[i]);
-    while (!queue[0].empty() || !queue[1].empty()) {
-        const bool fine = queue[0].empty() || queue[1].size() >= W;  // lanes are filled as long as there is what to fill them with
-        auto& from = queue[fine];
-        Lanes lanes;
-        lanes.count = from.size() < W ? from.size() : W;
-        for (int64_t l = 0; l < lanes.count; l++) lanes.sample[l] = from.back(), from.pop_back();
-        for (int64_t l = lanes.count; l < W; l++) lanes.sample[l] = lanes.sample[0];
-        const Filter& filter = fine ? *c.filter : *c.rough;
-        iterate(fine ? *c.fine : *c.coarse, filter, *c.out, lanes, room, numbers);
-        for (int64_t l = 0; l < lanes.count; l++) {
-            const int64_t b = lanes.sample[l], had = c.iterations[b]++;
-            if (fine && filter.done[b]) c.converged[b] = 1;
-            else if (had + 1 < c.most) {
-                if (!fine) c.near[b] = filter.done[b] || 2 * had >= c.most;
-                queue[c.near[b] != 0].push_back(b);
-            }
-        }
-    }
-}
-
+// Its iterations, all of them, for the samples `index`.
 void torchrod_filter(const Course* c, const int64_t* index, int64_t count, int64_t threads) {
-    // Each part ends with lanes that are not filled: in parts of 32 groups that is a few percent. But four to a thread there should be.
-    const int64_t groups = (count + W - 1) / W, least = std::clamp(groups / (4 * threads), int64_t(4), int64_t(32));
-    in_parts(groups, least, threads, [&](int64_t from, int64_t to) { run(*c, index + from * W, std::min(count, to * W) - from * W); });
+    sharing(count, W, threads, [&](auto take) { run(*c, index, take); });
 }
 
 // The base wrench (b, 6) in equilibrium with the loads of x (b, n), how far it is from that (b), the centre line (b, P, 3) and the
@@ -233,7 +168,7 @@ void torchrod_balance(const Fit* f, const double* x, const double* q_tip, int64_
 void torchrod_perceptron(const Perceptron* p, const float* x, int64_t count, float* y, int64_t threads) {
     const int64_t in = p->sizes[0], out = p->sizes[p->depth], block = FLOATS * BLOCK, blocks = (count + block - 1) / block;
     const int64_t widest = *std::max_element(p->sizes, p->sizes + p->depth + 1);
-    in_parts(blocks, 1, threads, [&](int64_t from, int64_t to) {
+    in_parts(blocks, threads, [&](int64_t from, int64_t to) {
         std::vector<F> numbers(2 * widest * BLOCK);
         for (int64_t first = from * block; first < to * block; first += block) {
             const int64_t here = count - first < block ? count - first : block;

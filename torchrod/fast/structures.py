@@ -1,4 +1,4 @@
-"""The structures of known.h, loads.h, measure.h, filter.h and kernel.cpp, for ctypes, and how tensors become them."""
+"""The structures of known.h, loads.h, measure.h, filter.h, course.h and kernel.cpp, for ctypes, and how tensors become them."""
 
 import ctypes
 from collections.abc import Mapping

@@ -77,18 +77,24 @@ class Crew {
     }
 };
 
-// work(from, to) for parts of 0 .. count, many to a thread and no smaller than `least`: a thread takes the next one when it is free,
-// so that a core which is busy elsewhere does not keep the others waiting, and none waits long for the last part of another.
-template <class Work> void in_parts(int64_t count, int64_t least, int64_t threads, Work work) {
-    const int64_t size = std::max(least, count / (64 * threads) + 1);
-    if (threads <= 1 || size >= count) return work(int64_t(0), count);
-    struct Parts {
-        Work& work;
-        const int64_t count, size;
-        std::atomic<int64_t> next{0};
-    } parts{work, count, size};
-    Crew::here().run(std::min(threads, (count + size - 1) / size), [](void* with) {
-        Parts& of = *static_cast<Parts*>(with);
-        for (int64_t from; (from = of.next.fetch_add(of.size)) < of.count;) of.work(from, std::min(from + of.size, of.count));
-    }, &parts);
+// work(take) on each of some threads, where take(from, to) gives a thread the next part of 0 .. count, no larger than `size`, or says
+// that there is none: a thread takes it when it is free, so that a core which is busy elsewhere does not keep the others waiting.
+template <class Work> void sharing(int64_t count, int64_t size, int64_t threads, Work work) {
+    std::atomic<int64_t> next{0};
+    auto all = [&] {
+        work([&](int64_t& from, int64_t& to) {
+            from = next.fetch_add(size), to = std::min(from + size, count);
+            return from < count;
+        });
+    };
+    threads = std::min(threads, (count + size - 1) / size);
+    if (threads <= 1) return all();
+    Crew::here().run(threads, [](void* with) { (*static_cast<decltype(all)*>(with))(); }, &all);
+}
+
+// work(from, to) for parts of 0 .. count, so many to a thread that none waits long for the last part of another.
+template <class Work> void in_parts(int64_t count, int64_t threads, Work work) {
+    sharing(count, count / (256 * threads) + 1, threads, [&](auto take) {
+        for (int64_t from, to; take(from, to);) work(from, to);
+    });
 }
