@@ -7,7 +7,7 @@ import numpy as np
 import peers
 import pytest
 from benchmarks.agreement import Disagreement, Tolerance, fit_differences, linear_differences, verify
-from benchmarks.bars import bars, ratios
+from benchmarks.bars import bars, ratios, straight
 from benchmarks.cases import ITERATION, STUDY, write, write_frames
 from benchmarks.figure import figure
 from benchmarks.measure import steady
@@ -91,6 +91,21 @@ def test_ratios_and_bars():
         assert {bar["what"]: bar["met"] for bar in bars(data)}[f"{line}: largest / smallest"] is True
         data["linear"][path]["4096"] *= 1.11
         assert {bar["what"]: bar["met"] for bar in bars(data)}[f"{line}: largest / smallest"] is False
+
+
+def test_a_straight_line():
+    """What a call costs once is no bend; a time per sample that creeps up is."""
+    batches = (256, 1024, 4096, 16384, 65536)
+    once, each, off = straight({b: (3e-3 + 4e-5 * b) / b for b in batches})
+    assert (once, each) == pytest.approx((3e-3, 4e-5))
+    assert off < 1e-9
+    *_, off = straight({b: 4e-5 * (b / 256) ** 0.1 for b in batches})
+    assert 0.1 < off < 0.2
+    data = canned()
+    for path in ("torchrod", WHOLE):
+        assert [bar["met"] for bar in data["bars"] if "off the line" in bar["what"]] == [True, True]
+        data["linear"][path] = {b: t * int(b) ** 0.1 for b, t in data["linear"][path].items()}
+    assert [bar["met"] for bar in bars(data) if "off the line" in bar["what"]] == [False, False]
 
 
 def test_a_machine_that_is_slower_for_a_while_is_so_for_all():

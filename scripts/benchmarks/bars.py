@@ -3,6 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from .plans import SHOWN, WHOLE
 
 OF_NUMBA, OF_JAX = 0.6, 0.05
@@ -12,6 +14,7 @@ FRAME, TAIL = 3e-3, 2.0  # s; the 99 % point over the median
 COMMAND, BEYOND = 1.5, 1.0  # times `import torch`, plus s
 PEAK = 1.5e9  # bytes
 LINEAR = 1.1  # time per sample, largest over smallest
+STRAIGHT = 0.1  # of a call's time, to the line that fits all batches best
 LARGE = 1024  # samples: in smaller calls what an estimate costs once, whatever its size, is a third of the time
 
 
@@ -40,7 +43,7 @@ def ratios(data: dict[str, Any]) -> dict[str, dict[str, dict[str, float]]]:
 
 def bars(data: dict[str, Any]) -> list[dict[str, Any]]:
     """All of them; `met` is None where nothing was measured."""
-    return [asdict(bar) for bar in [*_iteration(data), *_estimates(data), *_single(data), *_memory(data)]]
+    return [asdict(bar) for bar in [*_iteration(data), *_estimates(data), *_single(data), *_memory(data), *_linear(data)]]
 
 
 def _missing(what: str, bar: str) -> Bar:
@@ -93,13 +96,29 @@ def _single(data: dict[str, Any]) -> list[Bar]:
 
 
 def _memory(data: dict[str, Any]) -> list[Bar]:
-    """Peak memory and linear time."""
+    """Peak memory."""
     batch, peak = max(((batch, row["peak"]) for batch, row in data["memory"].items()), key=lambda pair: pair[1])
-    found = [Bar(f"peak memory (batch {batch})", f"{peak / 1e9:.2f} GB", f"< {PEAK / 1e9:g} GB", peak, peak < PEAK)]
+    return [Bar(f"peak memory (batch {batch})", f"{peak / 1e9:.2f} GB", f"< {PEAK / 1e9:g} GB", peak, peak < PEAK)]
+
+
+def _linear(data: dict[str, Any]) -> list[Bar]:
+    """Time linear in the batch: the same per sample, and as a straight line, which leaves aside what a call costs once."""
+    found = []
     for path, what in (("torchrod", "an iteration"), (WHOLE, "a whole estimate")):
         least = 0 if path == "torchrod" else LARGE
         times = {int(batch): seconds for batch, seconds in data["linear"][path].items() if int(batch) >= least}
         value = max(times.values()) / min(times.values())
         what = f"{what}'s time per sample, batches {min(times)} to {max(times)}: largest / smallest"
         found.append(Bar(what, f"{value:.2f}", f"<= {LINEAR:g}", value, value <= LINEAR))
+    for path, what in (("torchrod", "an iteration"), (WHOLE, "whole estimates")):
+        once, each, off = straight({int(batch): seconds for batch, seconds in data["linear"][path].items()})
+        what = f"{what}: a call's time, off the line {1e3 * once:.2f} ms + {1e6 * each:.1f} us a sample, at most"
+        found.append(Bar(what, f"{off:.1%}", f"<= {STRAIGHT:.0%}", off, off <= STRAIGHT))
     return found
+
+
+def straight(per_sample: dict[int, float]) -> tuple[float, float, float]:
+    """a + b B, the line that best fits the time of a call of B samples (least squares of relative errors): a, b, the largest error."""
+    batch, taken = np.array(list(per_sample)), np.array([b * t for b, t in per_sample.items()])
+    (a, b), *_ = np.linalg.lstsq(np.stack([1 / taken, batch / taken], -1), np.ones(len(taken)), rcond=None)
+    return float(a), float(b), float(np.abs((a + b * batch) / taken - 1).max())
