@@ -118,7 +118,7 @@ def _linear(data: dict[str, Any]) -> list[Bar]:
 
 
 def straight(per_sample: dict[int, float]) -> tuple[float, float, float]:
-    """a + b B, the line that fits the time of a call of B samples best (least squares of relative errors): a, b, the largest error."""
+    """a + b B, the line closest to the times of calls of B samples (least squares of relative errors): a, b, the largest error."""
     batch, taken = np.array(list(per_sample)), np.array([b * t for b, t in per_sample.items()])
     (a, b), *_ = np.linalg.lstsq(np.stack([1 / taken, batch / taken], -1), np.ones(len(taken)), rcond=None)
     return float(a), float(b), float(np.abs((a + b * batch) / taken - 1).max())
