@@ -4,10 +4,11 @@ import torch
 
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, Robot, cold_start, estimate
+from torchrod.equilibrium import without_load
 from torchrod.kept import kept, version
 from torchrod.rod import Rod
 
-S = T([0.1, 0.2, 0.3, 0.4])
+S = T([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
 
 
 def positions() -> torch.Tensor:
@@ -20,6 +21,9 @@ def test_markers_that_go_missing_in_place():
     assert markers.present is markers.present
     markers.positions[1, 2, 0] = torch.nan
     assert markers.present.tolist() == [[True] * 4, [True, True, False, True], [True] * 4]
+    markers.positions[0, 0, 2] = torch.nan
+    markers.positions[2, 3, 1] = torch.inf
+    assert (~markers.present).nonzero().tolist() == [[0, 0], [1, 2], [2, 3]]
     assert Markers(S[:3], positions()).misshapen is not None
 
 
@@ -47,6 +51,16 @@ def test_a_robot_that_changes_in_place():
         assert not torch.equal(found[0], found[1])
 
 
+def test_arc_lengths_that_change_in_place():
+    model = Model(Robot(busy_robot().rod, gravity=T([0.0, -9.81, 0.0])), GaussianCoordinates(1, 0.4, 1.0))
+    markers = Markers(S.clone(), positions())
+    before = without_load(model, markers).p
+    markers.s.mul_(0.9)
+    after = without_load(model, markers).p
+    assert torch.equal(after, without_load(model, Markers(0.9 * S, positions())).p)
+    assert not torch.equal(before, after)
+
+
 def test_a_tensor_of_inference_mode_is_looked_at_every_time():
     with torch.inference_mode():
         markers = Markers(S, positions().clone())
@@ -58,9 +72,11 @@ def test_a_tensor_of_inference_mode_is_looked_at_every_time():
 
 def test_what_is_kept_in_inference_mode_serves_autograd():
     markers, weight = Markers(S, positions()), torch.ones(3, 4, dtype=torch.float64, requires_grad=True)
+    model = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
     with torch.inference_mode():
-        cold_start(Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0)), markers, 1e-3)
+        without_load(model, markers)
         assert markers.present.all()
+    assert not without_load(model, markers).wrench.is_inference()
     torch.where(markers.present, weight, 0.0).sum().backward()
     assert weight.grad is not None
 
