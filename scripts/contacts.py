@@ -27,8 +27,8 @@ from torchrod import (
     find_warm_start,
     solve_shape,
 )
-from torchrod.loads import Load
-from torchrod.selection import Hypothesis, select
+from torchrod.analysis.count import Hypothesis, select
+from torchrod.mechanics.loads import Load
 
 ROBOT = steel_rod()
 NOISE, GAP, MOST = 1e-3, 0.08, 3

@@ -11,8 +11,8 @@ import torch
 from ablations.plans import make, reference_parts
 
 from tests.test_fast import needs_compiler
-from torchrod import cold_start, estimate, fast
-from torchrod.estimator import CHUNK_TORCH
+from torchrod import cold_start, estimate, kernel
+from torchrod.estimation.solve import CHUNK_TORCH
 
 pytestmark = needs_compiler
 # So many samples of a row of docs/warm_start.md; of "reference", draws of noise for every shape of the independent solver.
@@ -34,7 +34,7 @@ def test_both_paths_find_the_same_loads(name, monkeypatch):
         for compiled in (True, False):
             with monkeypatch.context() as m:
                 if not compiled:
-                    m.setattr(fast, "available", lambda: False)
+                    m.setattr(kernel, "available", lambda: False)
                 found.append(estimate(part.model, part.markers, part.noise, start=cold_start))
         one, other = found
         assert torch.equal(one.status, other.status)

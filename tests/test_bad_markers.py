@@ -12,7 +12,7 @@ from tests.conftest import reference
 from tests.robots import toml_of
 from torchrod import Markers
 from torchrod.cli import main
-from torchrod.geometry import misplaced, too_far, unit_hint
+from torchrod.model.marker_geometry import misplaced, too_far, unit_hint
 
 CASE = next(c for c in reference("shape") if c["name"] == "passive-point-1")
 GOOD = [[s, *p] for s, p in zip(CASE["s"], CASE["positions"], strict=True)]

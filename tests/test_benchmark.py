@@ -18,7 +18,7 @@ from benchmarks.torchrod_path import TorchrodPeer, kernel_seconds
 from benchmarks.worker import Worker, timed
 
 import torchrod
-from torchrod import Estimate, fast
+from torchrod import Estimate, kernel
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -213,7 +213,7 @@ def test_frames_go_through_an_estimator(folder, monkeypatch):
 
 
 def test_the_kernel_s_share_is_taken_where_torchrod_counts_it(monkeypatch):
-    monkeypatch.setattr(fast, "seconds", lambda: 1.5, raising=False)
+    monkeypatch.setattr(kernel, "seconds", lambda: 1.5, raising=False)
     assert kernel_seconds() == 1.5
     clock = iter(range(100))
     assert timed(lambda: None, 0.0, lambda: next(clock))["kernel_share"] > 0

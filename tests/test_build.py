@@ -9,19 +9,20 @@ from pathlib import Path
 
 from tests.test_dataset import spec
 from tests.test_fast import needs_compiler
-from torchrod import fast, production
+from torchrod import kernel
+from torchrod.data import workers as production
 
 SAID = """
 import warnings
 from torchrod import fast
 with warnings.catch_warnings(record=True) as seen:
     warnings.simplefilter("always")
-    assert [fast.library(wait=True) for _ in range(3)] == [None] * 3
+    assert [kernel.library(wait=True) for _ in range(3)] == [None] * 3
 said = [str(w.message) for w in seen if "no compiled kernel" in str(w.message)]
 assert len(said) == 1, said
 print(said[0])
 """
-LOADED = "from torchrod import fast; assert fast.library(wait=True) is not None"
+LOADED = "from torchrod import fast; assert kernel.library(wait=True) is not None"
 
 
 def compiler(folder: Path, *lines: str) -> Path:
@@ -34,7 +35,7 @@ def compiler(folder: Path, *lines: str) -> Path:
 
 def copying(folder: Path, *lines: str) -> Path:
     """One that hands out the library that is there."""
-    built = fast.library()
+    built = kernel.library()
     assert built is not None
     return compiler(folder, *lines, f'cp "{built._name}" "$last"')
 
@@ -187,7 +188,7 @@ def test_a_first_run_makes_the_same_shards_as_the_next(tmp_path):
 def test_a_pool_of_processes_finds_the_kernel_built(tmp_path, monkeypatch):
     """Otherwise every one of them would begin a build."""
     events = []
-    monkeypatch.setattr(fast, "library", lambda wait=False: events.append(wait))
+    monkeypatch.setattr(kernel, "library", lambda wait=False: events.append(wait))
     monkeypatch.setattr(production, "ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
     monkeypatch.setattr(production, "simulate_shard", lambda _, index: events.append("shard"))
     monkeypatch.setattr(production, "write_shard", lambda *_: None)

@@ -27,10 +27,10 @@ from torchrod import (
     solve_shape,
     write_shapes,
 )
+from torchrod.analysis.unloaded_shapes import UnloadedShapes
 from torchrod.cli import main
-from torchrod.lie import rotate
-from torchrod.status import Status
-from torchrod.unloaded import UnloadedShapes
+from torchrod.mechanics.lie import rotate
+from torchrod.util.status import Status
 
 T = torch.tensor
 NOISE = 2.5e-4
@@ -217,7 +217,7 @@ def test_too_few_iterations_are_reported():
 def test_an_offset_shifts_the_readings(fast, monkeypatch):
     """tension_offset = d is the same as readings larger by d, and a tendon never pushes: forward solve, march and Jacobian."""
     if fast == "0":
-        monkeypatch.setattr("torchrod.fast.available", lambda: False)
+        monkeypatch.setattr("torchrod.kernel.available", lambda: False)
     readings, d = T([[1.0, 2.0], [0.1, 3.0]]), T([0.3, -0.4])
     offset, plain = two_tendons(offsets=(0.3, -0.4)), two_tendons()
     s = T([0.56])

@@ -10,8 +10,8 @@ import torch
 
 from tests.robots import T, steel_rod
 from tests.test_fast import needs_compiler
-from torchrod import GaussianCoordinates, Markers, Model, fast
-from torchrod.prepared import Prepared
+from torchrod import GaussianCoordinates, Markers, Model, kernel
+from torchrod.estimation.evaluator import Prepared
 
 BEGIN = """
 import os, threading
@@ -20,7 +20,7 @@ from torchrod import fast
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)
 from tests import test_crew
-assert fast.library(wait=True) is not None
+assert kernel.library(wait=True) is not None
 call, tasks = test_crew.caller(400), lambda: len(os.listdir("/proc/self/task"))
 torch.set_num_threads(3)
 """
@@ -34,7 +34,7 @@ def caller(samples: int):
     return lambda: prepared.sums(x)
 
 
-def same(a: fast.Sums, b: fast.Sums) -> bool:
+def same(a: kernel.Sums, b: kernel.Sums) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in vars(a))
 
 

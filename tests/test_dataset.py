@@ -21,15 +21,15 @@ from torchrod import (
     Rod,
     Tendon,
     Tendons,
-    production,
     read_dataset,
     read_dataset_spec,
     simulate_shard,
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.dataset import ARRAYS, digest, drawn_load
-from torchrod.io import write_manifest, write_shard
+from torchrod.data import workers as production
+from torchrod.data.dataset import ARRAYS, digest, drawn_load
+from torchrod.data.shards import write_manifest, write_shard
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "docs" / "example"
 SPEC = (EXAMPLE / "dataset.toml").read_text().replace("20_000", "250").replace("5_000", "70")

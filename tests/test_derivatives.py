@@ -7,8 +7,8 @@ from torch.autograd import forward_ad
 from tests.robots import steel_rod
 from tests.test_fast import needs_compiler
 from tests.test_fit import B, case, close
-from torchrod import GaussianCoordinates, fast
-from torchrod.prepared import Prepared
+from torchrod import GaussianCoordinates, kernel
+from torchrod.estimation.evaluator import Prepared
 
 pytestmark = needs_compiler
 
@@ -27,7 +27,7 @@ def operator(x, tables, slopes=True):
 
 
 def cost(tables):
-    return lambda x: (fast.measured(x, torch.arange(B), tables) ** 2).sum()
+    return lambda x: (kernel.measured(x, torch.arange(B), tables) ** 2).sum()
 
 
 def gradient(h, H):
@@ -68,7 +68,7 @@ def test_a_backward_of_the_backward_is_refused(problem, way):
 def test_a_pullback_is_differentiable_in_what_is_pulled_back(problem):
     x, tables, h, H = problem
     leaf, dh = x.clone().requires_grad_(), torch.ones_like(h).requires_grad_()
-    (dx,) = torch.autograd.grad(fast.measured(leaf, torch.arange(B), tables), leaf, dh, create_graph=True)
+    (dx,) = torch.autograd.grad(kernel.measured(leaf, torch.arange(B), tables), leaf, dh, create_graph=True)
     assert close(torch.autograd.grad(dx.sum(), dh)[0], H.sum(-1))
 
 
@@ -104,7 +104,7 @@ def test_normal_equations_of_several_x_at_once(problem):
     x, tables, _, _ = problem
 
     def sums(x):
-        return fast.normal_equations(x, tables.tensors, tables.counts, tables.numbers)
+        return kernel.normal_equations(x, tables.tensors, tables.counts, tables.numbers)
 
     several = torch.stack([x, 0.9 * x, 1.1 * x], 1)
     for together, alone in zip(torch.func.vmap(sums, in_dims=1)(several), sums(0.9 * x), strict=True):

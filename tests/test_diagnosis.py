@@ -23,8 +23,8 @@ from torchrod import (
     solve_shape,
     write_shapes,
 )
+from torchrod.analysis.diagnosis import _misfit, _stretch
 from torchrod.cli import main
-from torchrod.diagnosis import _misfit, _stretch
 
 ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import reference
-from torchrod.cli import COMMANDS
+from torchrod.cli.parser import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -23,8 +23,8 @@ from torchrod import (
     solve_shape,
     write_shapes,
 )
+from torchrod.analysis.noise import white
 from torchrod.cli import main
-from torchrod.noise import white
 
 B, S = 200, torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 

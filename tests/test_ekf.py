@@ -2,7 +2,7 @@
 
 import torch
 
-from torchrod import ekf
+from torchrod.estimation import filter as ekf
 
 B, Z, N = 3, 20, 5
 

@@ -7,20 +7,10 @@ import torch
 
 from tests.robots import T, busy_robot, steel_rod
 from tests.test_fast import TENSION, needs_compiler, stiffened
-from torchrod import (
-    GaussianCoordinates,
-    Markers,
-    Model,
-    PaperCoordinates,
-    PointCoordinates,
-    Robot,
-    Tendon,
-    Tendons,
-    equilibrium,
-    fast,
-)
-from torchrod.equilibrium import Rest, at_rest, without_load
-from torchrod.statics import solve_shape
+from torchrod import GaussianCoordinates, Markers, Model, PaperCoordinates, PointCoordinates, Robot, Tendon, Tendons, kernel
+from torchrod.estimation import at_rest as equilibrium
+from torchrod.estimation.at_rest import Rest, at_rest, without_load
+from torchrod.mechanics.statics import solve_shape
 
 
 def heavy() -> Robot:
@@ -77,7 +67,7 @@ def test_it_is_the_forward_solve(robot, kind, compiled, monkeypatch):
     if compiled and kind != "point":  # a point moves the nodes, and is left to the forward solve
         monkeypatch.setattr(equilibrium, "solve_shape", None)
     elif not compiled:
-        monkeypatch.setattr(fast, "available", lambda: False)
+        monkeypatch.setattr(kernel, "available", lambda: False)
     agree(at_rest(model, markers, gamma), exact)
     agree(without_load(model, markers), bare)
     loads = model.coordinates.loads(gamma)

@@ -20,11 +20,11 @@ from torchrod import (
     Start,
     Status,
     estimate,
-    estimator,
     paper_settings,
     solve_shape,
 )
-from torchrod.estimator import linearize
+from torchrod.estimation import solve as estimator
+from torchrod.estimation.solve import linearize
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """The compiled march against the torch step, which is the definition: values and Jacobians of the discrete steps, to round-off.
 
-Whoever changes torchrod/step.py or torchrod/tendons.py without kernel.cpp fails here.
+Whoever changes torchrod/mechanics/section.py or torchrod/mechanics/tendons.py without kernel.cpp fails here.
 """
 
 import subprocess
@@ -20,15 +20,15 @@ from torchrod import (
     PointWrenches,
     Robot,
     Rod,
-    fast,
     forward_jacobian,
-    march,
+    kernel,
     shape_from_base,
     solve_shape,
 )
+from torchrod.mechanics import integrate as march
 
 needs_compiler = pytest.mark.skipif(
-    fast.library(wait=True) is None, reason="no kernel here (no C++ compiler, or TORCHROD_FAST=0): there is only the torch path"
+    kernel.library(wait=True) is None, reason="no kernel here (no C++ compiler, or TORCHROD_FAST=0): there is only the torch path"
 )
 TENSION = T([[3.0, 2.0], [1.0, 4.0], [0.0, 7.0]], dtype=torch.float64)
 
@@ -80,7 +80,7 @@ def test_the_forward_solve(monkeypatch):
         return solve_shape(robot, (local, dead, points), TENSION, s, 3, 10)
 
     compiled = solve()
-    monkeypatch.setattr(fast, "available", lambda: False)
+    monkeypatch.setattr(kernel, "available", lambda: False)
     plain = solve()
     assert torch.equal(compiled.status, plain.status)
     assert (compiled.p - plain.p).abs().max() < 1e-10
@@ -139,7 +139,7 @@ assert sum("no compiled kernel" in str(w.message) for w in seen) == 1, [str(w.me
 @needs_compiler
 def test_a_first_estimate_does_not_wait_for_a_slow_build(tmp_path):
     """The torch path serves meanwhile, without a word; whoever asks later gets the library."""
-    built = fast.library()
+    built = kernel.library()
     assert built is not None
     compiler = tmp_path / "slow-c++"
     compiler.write_text(f'#!/bin/sh\nsleep 8\nfor last; do :; done\ncp "{built._name}" "$last"\n')
@@ -151,12 +151,12 @@ robot = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), gravity=torch.tensor
 begun = time.monotonic()
 with warnings.catch_warnings():
     warnings.filterwarnings("error", message=".*compiled kernel.*")
-    assert not fast.available()
+    assert not kernel.available()
     assert time.monotonic() - begun < 4
     shape = solve_shape(robot, (), None, torch.tensor([0.4], dtype=torch.float64), 1, 4)
 assert shape.status[0] == 0
-assert fast.library(wait=True) is not None
-assert fast.available()
+assert kernel.library(wait=True) is not None
+assert kernel.available()
 """
     environment = {"PATH": "/usr/bin:/bin", "CXX": str(compiler), "TORCHROD_CACHE": str(tmp_path / "cache")}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
@@ -167,7 +167,7 @@ assert fast.available()
 @pytest.mark.parametrize("backend", ["", "aot_eager"])
 def test_the_torch_path_steps_with_its_tangents(backend, monkeypatch):
     """Without the kernel, step by step and traced whole, against torch.func through the whole march, tip to base as well."""
-    monkeypatch.setattr(fast, "available", lambda: False)
+    monkeypatch.setattr(kernel, "available", lambda: False)
     monkeypatch.setenv("TORCHROD_COMPILE", backend)
     monkeypatch.setattr(march, "_step", march._step.__wrapped__)
     robot = busy_robot()

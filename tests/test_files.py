@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from tests.robots import T
-from torchrod import Markers, Shapes, WarmStart, files, read_robot, read_shapes, write_shapes
-from torchrod.arguments import writable
+from torchrod import Markers, Shapes, WarmStart, read_robot, read_shapes, write_shapes
 from torchrod.cli import main
-from torchrod.errors import InputError
-from torchrod.files import put, put_text
+from torchrod.cli.arguments import writable
 from torchrod.io import read_fit
+from torchrod.util import files
+from torchrod.util.errors import InputError
+from torchrod.util.files import put, put_text
 
 ROOT = Path(__file__).resolve().parents[1]
 SHAPES = Shapes(Markers(T([0.1, 0.2]), torch.zeros(1, 2, 3)), ["0"])

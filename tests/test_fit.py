@@ -21,16 +21,16 @@ from torchrod import (
     Robot,
     Settings,
     cold_start,
-    ekf,
     estimate,
-    fast,
     forward_jacobian,
+    kernel,
     solve_shape,
 )
-from torchrod.lie import move
-from torchrod.measurement import TIP_EXACT
-from torchrod.prepared import Prepared
-from torchrod.tendons import Tendon, Tendons
+from torchrod.estimation import filter as ekf
+from torchrod.estimation.evaluator import Prepared
+from torchrod.mechanics.lie import move
+from torchrod.mechanics.tendons import Tendon, Tendons
+from torchrod.model.measurement import TIP_EXACT
 
 pytestmark = needs_compiler
 B = 5
@@ -93,7 +93,7 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     assert prepared.compiled
     h, H = forward_jacobian(lambda x: model.h(x, markers), x)
     tables = prepared.tables(x)
-    found = fast.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
+    found = kernel.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
     assert close(found[0], h)
     assert close(found[1], H)
     assert close(prepared.h(x), h)
@@ -130,12 +130,12 @@ def test_the_covariance():
 
 
 def test_one_iteration_of_the_filter():
-    """fast.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
+    """kernel.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
     model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
     prepared = Prepared(model, markers, model.weights(markers, 0.1))
     fitted = estimate(model, markers, 0.1).x
     x[0], x[3, 0] = fitted[0], torch.nan
-    sums = fast.Sums.room(B, model.size, 3)
+    sums = kernel.Sums.room(B, model.size, 3)
     sums.A.fill_(torch.nan)
     Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
     start = ekf.Iterate(
@@ -161,15 +161,15 @@ def test_another_type_of_number_is_refused_before_the_kernel_writes_beyond_it():
     prepared = Prepared(model, markers, model.weights(markers, 1e-3))
     tables, index = prepared.tables(x), torch.arange(B)
     with pytest.raises(TypeError, match=r"x is torch.float32.*torch.float64"):
-        fast.measure_now(x.float(), index, True, tables.structure, tables.markers)
+        kernel.measure_now(x.float(), index, True, tables.structure, tables.markers)
     with pytest.raises(TypeError, match=r"index is torch.int32.*torch.int64"):
-        fast.measure_now(x, index.int(), True, tables.structure, tables.markers)
+        kernel.measure_now(x, index.int(), True, tables.structure, tables.markers)
     for call in (prepared.cost, prepared.sums, prepared.h):
         with pytest.raises(TypeError, match=r"x is torch.float32"):
             call(x.float())
     with pytest.raises(TypeError, match=r"positions is torch.float32"):
         tables.with_rows(markers.positions.float(), prepared.w, 4.0)
-    sums = fast.Sums.room(B, model.size, 3)
+    sums = kernel.Sums.room(B, model.size, 3)
     Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
     state = {"Sigma": Sigma0.clone(), "before": x.clone(), "cap": torch.ones(B), "done": torch.zeros(B, dtype=torch.bool)}
     for wrong in ({"x": x.float()}, {"x": x.clone(), "done": torch.zeros(B)}):
@@ -184,7 +184,7 @@ def test_gradients_and_transforms_go_through_the_operator():
     h, H = model.linearized(x, markers)
 
     def measured(x):
-        return fast.measured(x, index, tables)
+        return kernel.measured(x, index, tables)
 
     assert close(measured(x), h)
     dx, dh = torch.randn_like(x), torch.randn_like(h)
@@ -198,8 +198,8 @@ def test_gradients_and_transforms_go_through_the_operator():
     _, J = forward_jacobian(measured, x)
     assert close(J, H)
     arguments = (x, index, True, tables.tensors, tables.counts, tables.numbers)
-    torch.library.opcheck(fast.measure, arguments, test_utils=("test_schema", "test_faketensor", "test_autograd_registration"))
-    torch.library.opcheck(fast.normal_equations, (x, *arguments[3:]), test_utils=("test_schema", "test_faketensor"))
+    torch.library.opcheck(kernel.measure, arguments, test_utils=("test_schema", "test_faketensor", "test_autograd_registration"))
+    torch.library.opcheck(kernel.normal_equations, (x, *arguments[3:]), test_utils=("test_schema", "test_faketensor"))
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -208,7 +208,7 @@ def test_torch_compile_goes_through_the_operator():
     tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
 
     def cost(x):
-        h, H, _ = fast.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
+        h, H, _ = kernel.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
         return (h * h).sum(-1) + (H * H).sum((-1, -2))
 
     compiled = torch.compile(cost, backend="aot_eager", fullgraph=True)
@@ -237,7 +237,7 @@ def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     coordinates = PointCoordinates(n, 0.4, 1.0) if points else GaussianCoordinates(n, 0.4, 1.0)
     model, markers = Model(robot, coordinates, kind == "registration", steps=20), Markers(s, p, None, tension)
     compiled = fits(model, markers)
-    monkeypatch.setattr(fast, "available", lambda: False)
+    monkeypatch.setattr(kernel, "available", lambda: False)
     plain = fits(model, markers)
     assert torch.equal(compiled.status, plain.status)
     assert torch.equal(compiled.iterations, plain.iterations)

@@ -35,8 +35,8 @@ from torchrod import (
     solve_displacement,
     solve_shape,
 )
-from torchrod.grid import make_grid
-from torchrod.warmstart import shipped
+from torchrod.learned.warm_start import shipped
+from torchrod.mechanics.grid import make_grid
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ import torch
 
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, PointCoordinates, forward_jacobian
-from torchrod.jacobian import pointwise_jacobian
-from torchrod.lie import exponential, logarithm, product
-from torchrod.result import load_covariance
+from torchrod.estimation.result import load_covariance
+from torchrod.mechanics.jacobian import pointwise_jacobian
+from torchrod.mechanics.lie import exponential, logarithm, product
 
 
 def check(model: Model, markers: Markers, x: torch.Tensor) -> None:

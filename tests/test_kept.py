@@ -4,9 +4,9 @@ import torch
 
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, Robot, cold_start, estimate
-from torchrod.equilibrium import without_load
-from torchrod.kept import kept, version
-from torchrod.rod import Rod
+from torchrod.estimation.at_rest import without_load
+from torchrod.mechanics.rod import Rod
+from torchrod.util.kept import kept, version
 
 S = T([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
 

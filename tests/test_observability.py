@@ -11,30 +11,10 @@ import torch
 
 from tests.conftest import reference
 from tests.robots import T, busy_robot, steel_rod, toml_of
-from torchrod import (
-    GaussianCoordinates,
-    Markers,
-    Model,
-    PointForces,
-    Robot,
-    Rod,
-    bounds,
-    estimate,
-    load_bound,
-    place,
-    solve_shape,
-)
+from torchrod import GaussianCoordinates, Markers, Model, PointForces, Robot, Rod, bounds, estimate, load_bound, place, solve_shape
+from torchrod.analysis.marker_placement import KNOWN, _information, even_layout
+from torchrod.analysis.observability import covariance, held, noncentrality, push_model, pushed, seen_by, sensitivity
 from torchrod.cli import main
-from torchrod.observability import (
-    covariance,
-    held,
-    noncentrality,
-    push_model,
-    pushed,
-    seen_by,
-    sensitivity,
-)
-from torchrod.placement import KNOWN, _information, even_layout
 
 AT = torch.linspace(0.04, 0.36, 5, dtype=torch.float64)
 S = torch.linspace(0.04, 0.4, 10, dtype=torch.float64)
@@ -177,8 +157,8 @@ def test_proposed_markers():
 
 def test_command(tmp_path, capsys, monkeypatch):
     """Table, figure, CSV and JSON of a passive rod; proposed markers of a tendon robot."""
-    monkeypatch.setattr("torchrod.observability.PLACES", 6)
-    monkeypatch.setattr("torchrod.placement.PLACES", 6)
+    monkeypatch.setattr("torchrod.analysis.observability.PLACES", 6)
+    monkeypatch.setattr("torchrod.analysis.marker_placement.PLACES", 6)
     robot, figure, table, result = (str(tmp_path / n) for n in ("robot.toml", "figure.png", "table.csv", "result.json"))
     Path(robot).write_text(ROD)
     assert main(["observability", robot, "--markers", "10", "--force", "1", "--csv", table, "--json", result]) == 0

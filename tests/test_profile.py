@@ -23,7 +23,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.profile import joined_profile
+from torchrod.estimation.load_profile import joined_profile
 
 S20 = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 

@@ -9,8 +9,8 @@ import torch
 
 from tests.robots import T, steel_rod
 from torchrod import GaussianCoordinates, GaussianLoads, Markers, Model, PointForces, PointWrenches, estimate, solve_shape
+from torchrod.analysis.score_test import probe
 from torchrod.cli import main
-from torchrod.probe import probe
 
 S = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"

@@ -5,7 +5,7 @@ import torch
 
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import Estimator, GaussianCoordinates, Model, PointForces, Status, solve_shape
-from torchrod.threads import kernel_threads, one_thread
+from torchrod.util.threads import kernel_threads, one_thread
 
 FRAMES = 25
 

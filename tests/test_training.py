@@ -12,9 +12,9 @@ pytest.importorskip("lightning", reason="lightning is not installed: pip install
 
 from safetensors.torch import load_file
 
-from torchrod import WarmStart, fast
-from torchrod.features import ACTIVE_SIZE, PASSIVE_SIZE
-from torchrod.tendons import NEWTON_STEPS
+from torchrod import WarmStart, kernel
+from torchrod.learned.features import ACTIVE_SIZE, PASSIVE_SIZE
+from torchrod.mechanics.tendons import NEWTON_STEPS
 from training.cases import LEAST_SEEN, Recipe, block, generator_of, random_robot
 from training.data import ShapeData
 from training.train import main
@@ -52,7 +52,7 @@ def test_a_block_is_a_pure_function_of_its_recipe(recipe, inputs):
 def test_no_case_is_made_before_the_kernel_is_built(tmp_path, monkeypatch, workers):
     """Otherwise the cases of a first run would be the torch path's up to some block."""
     events = []
-    monkeypatch.setattr(fast, "library", lambda wait=False: events.append(("library", wait)))
+    monkeypatch.setattr(kernel, "library", lambda wait=False: events.append(("library", wait)))
     monkeypatch.setattr("training.data.block", lambda *_: events.append(("block",)) or {"x": torch.zeros(1)})
     monkeypatch.setattr("training.data.ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
     ShapeData(SMALL, cache=str(tmp_path), workers=workers).prepare_data()
@@ -62,8 +62,8 @@ def test_no_case_is_made_before_the_kernel_is_built(tmp_path, monkeypatch, worke
 def test_a_block_may_be_larger_than_a_chunk_of_the_estimator(monkeypatch):
     """Where there is no kernel, or it is still being built, chunks are smaller than the blocks of the shipped recipes."""
     whole = block(SMALL, 0)
-    monkeypatch.setattr("torchrod.estimator.CHUNK", 40)
-    monkeypatch.setattr("torchrod.estimator.CHUNK_TORCH", 40)
+    monkeypatch.setattr("torchrod.estimation.solve.CHUNK", 40)
+    monkeypatch.setattr("torchrod.estimation.solve.CHUNK_TORCH", 40)
     parts = block(SMALL, 0)
     assert all(torch.allclose(whole[name], parts[name], rtol=1e-4, atol=1e-5) for name in whole)
 

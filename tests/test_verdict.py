@@ -5,9 +5,9 @@ import torch
 
 from tests.robots import T, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, estimate
-from torchrod.fast import Sums
-from torchrod.prepared import Prepared
-from torchrod.verdict import limit, verdict
+from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.verdict import limit, verdict
+from torchrod.kernel import Sums
 
 S = T([0.08, 0.16, 0.24, 0.32, 0.4], dtype=torch.float64)
 POSITIONS = torch.stack([0.02 * S, 0 * S, S], -1).repeat(3, 1, 1)

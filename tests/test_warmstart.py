@@ -30,16 +30,16 @@ from torchrod import (
     WarmStart,
     cold_start,
     estimate,
-    fast,
     find_warm_start,
+    kernel,
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.features import GRID, features, smoothed
-from torchrod.network import digest, load_checkpoint, save_checkpoint
-from torchrod.prepared import Prepared
-from torchrod.status import Learned
-from torchrod.warmstart import shipped
+from torchrod.estimation.evaluator import Prepared
+from torchrod.learned.features import GRID, features, smoothed
+from torchrod.learned.network import digest, load_checkpoint, save_checkpoint
+from torchrod.learned.warm_start import shipped
+from torchrod.util.status import Learned
 
 ROOT = Path(__file__).resolve().parents[1]
 ROD_1 = ROOT / "checkpoints" / "rod_1.safetensors"
@@ -246,7 +246,7 @@ def test_the_compiled_layers_are_the_networks(monkeypatch):
             weight.mul_(scale)
         compiled = network.hidden(x)
         with monkeypatch.context() as without:
-            without.setattr(fast, "available", lambda: False)
+            without.setattr(kernel, "available", lambda: False)
             assert torch.allclose(compiled, network.hidden(x), rtol=1e-5, atol=1e-6 * scale), "single precision"
 
 

@@ -27,11 +27,11 @@ from torchrod import (
     simulate_shard,
     solve_shape,
 )
-from torchrod.estimator import CHUNK
-from torchrod.features import features, prior_log_c
-from torchrod.network import PER_LOAD, turn_of_gamma
-from torchrod.prepared import Prepared
-from torchrod.starts import in_equilibrium
+from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.solve import CHUNK
+from torchrod.estimation.starts import in_equilibrium
+from torchrod.learned.features import features, prior_log_c
+from torchrod.learned.network import PER_LOAD, turn_of_gamma
 
 L, DIAMETER, E, G = 0.4, 0.0014, 207e9, 79e9  # of the rod; the features are dimensionless, so one rod stands for all
 LEAST_SEEN = 8

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 from tqdm import tqdm
 
 import torchrod
-from torchrod import fast
+from torchrod import kernel
 
 from .cases import COLUMNS, Recipe, block
 
@@ -30,7 +30,7 @@ def make_block(recipe: Recipe, folder: Path, index: int) -> None:
 
     It waits for the kernel where that is being built: no case may depend on when that ends.
     """
-    fast.library(wait=True)
+    kernel.library(wait=True)
     path = folder / f"{index:04d}.safetensors"
     part = path.with_suffix(f".{os.getpid()}")
     before = torch.get_num_threads(), torch.get_default_dtype()
@@ -81,7 +81,7 @@ class ShapeData(LightningDataModule):
         self.folder.mkdir(parents=True, exist_ok=True)
         missing = [i for i in range(self.recipe.blocks) if not (self.folder / f"{i:04d}.safetensors").is_file()]
         if missing:
-            fast.library(wait=True)  # here as well, so that the processes do not all begin a build
+            kernel.library(wait=True)  # here as well, so that the processes do not all begin a build
         make = partial(make_block, self.recipe, self.folder)
         if self.workers < 2 or len(missing) < 2:
             for i in tqdm(missing, desc="cases", unit="block", delay=1.0, disable=None):

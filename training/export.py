@@ -10,7 +10,7 @@ from lightning.pytorch.loggers import CSVLogger
 from matplotlib.figure import Figure
 
 import torchrod
-from torchrod.network import save_checkpoint
+from torchrod.learned.network import save_checkpoint
 
 from .data import ShapeData
 from .module import WarmStartModule

@@ -6,8 +6,8 @@ import torch
 from lightning import LightningModule
 from torch import Tensor
 
-from torchrod.features import ACTIVE_SIZE, PASSIVE_SIZE
-from torchrod.network import Network, Prediction
+from torchrod.learned.features import ACTIVE_SIZE, PASSIVE_SIZE
+from torchrod.learned.network import Network, Prediction
 
 from .data import ShapeData
 
@@ -16,7 +16,7 @@ QUANTILES = (0.25, 0.5, 0.75, 0.95)
 
 
 class WarmStartModule(LightningModule):
-    """The network of torchrod.network, trained by AdamW under a one-cycle schedule.
+    """The network of torchrod.learned.network, trained by AdamW under a one-cycle schedule.
 
     (1)  loss = mean log(1 + d^T M d) + NLL,    d = predicted - target gamma, M the information on gamma: what the error costs
                                                 the filter in chi^2, on a scale on which the worst cases do not drown the rest

@@ -13,7 +13,7 @@ from reproduction.study2 import Study2
 from torch import Tensor
 
 from torchrod import GaussianCoordinates, Markers, Model, PointForces, Robot, solve_shape
-from torchrod.starts import in_equilibrium
+from torchrod.estimation.starts import in_equilibrium
 
 MM = 1e-3
 SEED = 41_000  # far from the seeds of training and of the studies

@@ -10,14 +10,15 @@ from reproduction.cases import L
 from reproduction.study2 import force_error
 from torch import Tensor
 
-from torchrod import Estimate, Markers, Model, Settings, Start, Status, WarmStart, cold_start, ekf, estimate, find_warm_start
-from torchrod.equilibrium import at_rest
-from torchrod.estimator import CHUNK, CHUNK_TORCH, linearize
-from torchrod.fast import Sums, available
-from torchrod.features import features
-from torchrod.loads import Load
-from torchrod.prepared import Prepared
-from torchrod.starts import StartRule, better_start, cold_from, costs_in_equilibrium
+from torchrod import Estimate, Markers, Model, Settings, Start, Status, WarmStart, cold_start, estimate, find_warm_start
+from torchrod.estimation import filter as ekf
+from torchrod.estimation.at_rest import at_rest
+from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.solve import CHUNK, CHUNK_TORCH, linearize
+from torchrod.estimation.starts import StartRule, better_start, cold_from, costs_in_equilibrium
+from torchrod.kernel import Sums, available
+from torchrod.learned.features import features
+from torchrod.mechanics.loads import Load
 
 from .cases import Case, Part
 

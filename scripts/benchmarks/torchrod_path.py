@@ -7,9 +7,10 @@ import numpy as np
 import torch
 from peers import Fit, Problem
 
-from torchrod import Estimate, Estimator, Markers, Settings, cold_start, ekf, estimate, fast, find_warm_start
-from torchrod.estimator import CHUNK
-from torchrod.prepared import Prepared
+from torchrod import Estimate, Estimator, Markers, Settings, cold_start, estimate, find_warm_start, kernel
+from torchrod.estimation import filter as ekf
+from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.solve import CHUNK
 
 from .cases import Case
 
@@ -54,7 +55,7 @@ class TorchrodPeer:
         """
         markers, n = self.markers(positions), self.model.size
         at = ekf.Iterate(*(torch.from_numpy(a) for a in state))
-        Sigma0, sums = torch.eye(n, dtype=torch.float64).repeat(len(at.x), 1, 1), fast.Sums.room(len(at.x), n, len(self.s))
+        Sigma0, sums = torch.eye(n, dtype=torch.float64).repeat(len(at.x), 1, 1), kernel.Sums.room(len(at.x), n, len(self.s))
         prepared = Prepared(self.model, markers, self.model.weights(markers, self.case.noise))
         once, index = prepared.iteration(at, Sigma0, torch.ones_like(at.x[0]), ekf.Limits(), sums), torch.arange(len(at.x))
         return lambda: once(index)
@@ -79,7 +80,7 @@ class TorchrodPeer:
 
 def kernel_seconds() -> float:
     """Seconds spent in the compiled kernel so far."""
-    return fast.seconds()
+    return kernel.seconds()
 
 
 def as_fit(fit: Estimate) -> Fit:

@@ -14,13 +14,13 @@ from torchrod import (
     Settings,
     Tendon,
     Tendons,
-    ekf,
     estimate,
     paper_settings,
     solve_shape,
 )
-from torchrod.estimator import cold_start, linearize
-from torchrod.lie import rotate
+from torchrod.estimation import filter as ekf
+from torchrod.estimation.solve import cold_start, linearize
+from torchrod.mechanics.lie import rotate
 
 from .cases import L, S, Study, steel_rod
 

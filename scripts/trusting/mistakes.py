@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 
 from torchrod import Settings, cold_start, diagnose, estimate
-from torchrod.selection import Hypothesis, select
+from torchrod.analysis.count import Hypothesis, select
 
 from .cases import NOISE, exchanged, generator, in_parallel, model, moved, noisy, touched
 from .markers import Row as Spoiled

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from torchrod import Settings, cold_start, estimate_noise_among
-from torchrod.selection import Hypothesis, select
+from torchrod.analysis.count import Hypothesis, select
 
 from .cases import generator, in_parallel, model, touched
 from .mistakes import Quiet

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchrod import Equilibrium, PointWrenches, Robot, Rod, Tendons, solve_shape
-from torchrod.lie import rotate
+from torchrod.mechanics.lie import rotate
 
 from .common import GREY, RED, TEAL, Row, all_solved, as_data, distance, tensor, third_party
 

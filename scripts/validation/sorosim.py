@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchrod import Equilibrium, PointWrenches, Robot, Rod, Tendons, solve_shape
-from torchrod.lie import rotate
+from torchrod.mechanics.lie import rotate
 
 from .common import FINE, GREY, NAVY, RED, TEAL, Row, all_solved, as_data, distance, tensor, third_party
 

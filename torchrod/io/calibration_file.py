@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ..calibration import Calibration
-from ..unloaded import MASS, OFFSET
+from ..analysis.calibration import Calibration
+from ..analysis.unloaded_shapes import MASS, OFFSET
 from .json_file import plain, put_json
 
 CALIBRATION_SUFFIXES = (".json",)

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ..files import put_text
+from ..util.files import put_text
 
 
 def plain(value: float) -> float | None:

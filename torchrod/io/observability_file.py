@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..files import put_text
-from ..observability import FALSE_ALARM, LOCALIZED, POWER, Observability
-from ..placement import Placement
+from ..analysis.marker_placement import Placement
+from ..analysis.observability import FALSE_ALARM, LOCALIZED, POWER, Observability
+from ..util.files import put_text
 from .json_file import plain, put_json
 
 

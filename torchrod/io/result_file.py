@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..diagnosis import Diagnosis
-from ..errors import InputError
-from ..files import put, put_text, reading
-from ..fit import Evidence, Fit
-from ..noise import Noise
-from ..profile import Profile
-from ..result import Estimate
-from ..status import Status
+from ..analysis.diagnosis import Diagnosis
+from ..analysis.noise import Noise
+from ..estimation.fit import Evidence, Fit
+from ..estimation.load_profile import Profile
+from ..estimation.result import Estimate
+from ..util.errors import InputError
+from ..util.files import put, put_text, reading
+from ..util.status import Status
 from .json_file import plain
 
 RESULT_SUFFIXES = (".json", ".npz")

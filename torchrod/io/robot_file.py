@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 
-from ..errors import InputError
-from ..precision import DTYPE
-from ..robot import Robot
-from ..rod import Rod
-from ..tendons import Tendon, Tendons
+from ..mechanics.robot import Robot
+from ..mechanics.rod import Rod
+from ..mechanics.tendons import Tendon, Tendons
+from ..util.errors import InputError
+from ..util.precision import DTYPE
 from .values import as_number, as_numbers, as_rows, as_table, read_toml
 
 TOP_KEYS = {"name", "rod", "tendons"}

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import torch
 
-from ..errors import InputError
-from ..files import put_text, reading
-from ..robot import Robot
+from ..mechanics.robot import Robot
+from ..util.errors import InputError
+from ..util.files import put_text, reading
 from .robot_file import robot_of
 
 HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([\w-]+)[ \t]*\]{1,2}[ \t]*(?:#.*)?$")

@@ -12,12 +12,12 @@ from typing import IO
 import numpy as np
 import torch
 
-from ..errors import InputError
-from ..files import put_text, reading
-from ..geometry import too_far, too_short
-from ..grid import on_rod
-from ..measurement import Markers
-from ..robot import Robot
+from ..mechanics.grid import on_rod
+from ..mechanics.robot import Robot
+from ..model.marker_geometry import too_far, too_short
+from ..model.measurement import Markers
+from ..util.errors import InputError
+from ..util.files import put_text, reading
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")

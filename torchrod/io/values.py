@@ -6,8 +6,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..files import reading
+from ..util.errors import InputError
+from ..util.files import reading
 
 
 def read_toml(path: Path) -> dict[str, Any]:

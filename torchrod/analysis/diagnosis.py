@@ -1,0 +1,273 @@
+"""Why does a fit not explain its markers? Labels exchanged, a base frame off, a load too few, the unit, outliers. It only tells.
+
+A rod of arc length s_j - s_i between two markers holds them no farther apart than that, whatever bends it (r: their offsets from
+the centre line):
+
+    (1)  V = sum_(i<j) max(0, |z_i - z_j| - |s_i - s_j| - |r_i| - |r_j|)^2
+
+is zero but for noise, and large where labels are exchanged. Two labels after two are exchanged where that lowers (1), or the
+squared residual of the fit, the most; the robot is fitted to the markers so labelled, and only a fit that explains them far better
+speaks for the exchange. (1) finds them where the fit itself was led astray, the residual where (1) is slack: with offsets, or
+markers closer together than a few standard deviations. The fit that is reported is never changed.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..estimation.result import Estimate
+from ..estimation.solve import Settings, estimate
+from ..model.load_families import GaussianCoordinates
+from ..model.marker_geometry import misplaced
+from ..model.measurement import Markers, Model
+from ..model.validate import usable
+from ..util.status import Status
+
+Cycle = tuple[int, ...]
+MOST_EXCHANGES = 3
+LOWERED = 0.5  # an exchange must halve what it is tried for, and chi^2, to be told
+TRANSLATION, ROTATION = 0.1, 0.35  # of the length, and rad: a base frame that is farther off than that is another mistake
+SURE = 10.0  # BIC: by so much a base frame must do better before it speaks against a fit that is accepted
+ITERATIONS = 60
+ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
+FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
+CHUNK = 64  # samples at a time: the table of exchanges holds (markers)^3 numbers of each while it is made
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What explains the markers of B samples far better than their fit; for most nothing.
+
+    s: (P,) m, of the markers. exchanged: per sample the groups of markers (counted from 0) whose labels look exchanged, mostly
+    pairs. registration: (B, 6) [m, rad], an error of the base frame that explains the markers; NaN where none does. one_more: (B,),
+    where one more load does. geometry: per sample what is wrong with its markers' unit, frame or order, or nothing. outliers: per
+    sample the markers without which a robust fit explains the others.
+    """
+
+    s: Float[Tensor, " P"]
+    exchanged: tuple[tuple[Cycle, ...], ...]
+    registration: Float[Tensor, "B 6"]
+    one_more: Bool[Tensor, " B"]
+    geometry: tuple[str, ...]
+    outliers: tuple[Cycle, ...]
+
+    def suspects(self, sample: int) -> list[dict[str, object]]:
+        """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
+        s = self.s.tolist()
+        groups = [(cycle, "exchanged") for cycle in self.exchanged[sample]] + [((i,), "outlier") for i in self.outliers[sample]]
+        return [{"markers": [i + 1 for i in group], "s_m": [s[i] for i in group], "suspicion": what} for group, what in groups]
+
+    def _named(self, markers: Cycle) -> str:
+        names, places = _listed([str(i + 1) for i in markers]), _listed([f"{1e3 * float(self.s[i]):.4g}" for i in markers])
+        return f"Marker{'s' * (len(markers) > 1)} {names} (s = {places} mm)"
+
+    def message(self, sample: int) -> str:
+        """Sentences with the remedy, or nothing."""
+        said = []
+        for cycle in self.exchanged[sample]:
+            said.append(f"{self._named(cycle)} look exchanged; exchange their labels.")
+        if off := self.outliers[sample]:
+            said.append(f"{self._named(off)} look{' like outliers' if off[1:] else 's like an outlier'}; try --robust.")
+        zeta = self.registration[sample]
+        if bool(torch.isfinite(zeta).all()):
+            shift, turn = 1e3 * float(zeta[:3].norm()), float(zeta[3:].norm().rad2deg())
+            said.append(
+                f"The residual near the base looks like a registration error of about {shift:.2g} mm and {turn:.2g} degrees; "
+                "try --registration."
+            )
+        if bool(self.one_more[sample]):
+            said.append("One more contact explains the markers; try more --contacts.")
+        if self.geometry[sample]:
+            said.append(self.geometry[sample])
+        return " ".join(said)
+
+
+def _listed(words: list[str]) -> str:
+    return f"{', '.join(words[:-1])} and {words[-1]}" if words[1:] else words[0]
+
+
+def _stretch(markers: Markers, z: Float[Tensor, "b P 3"]) -> Float[Tensor, "b P P"]:
+    """(1) after the labels of every two markers are exchanged (m^2); on the diagonal as it is. O(P^3): only rows i and j change."""
+    reach = (markers.s.unsqueeze(-1) - markers.s).abs()
+    if markers.offsets is not None:
+        size = markers.offsets.norm(dim=-1)
+        reach = reach + size.unsqueeze(-1) + size
+    apart = (z.unsqueeze(2) - z.unsqueeze(1)).norm(dim=-1)
+    excess = (apart - reach).clamp(min=0).square().nan_to_num(0.0)
+    rows = excess.sum(-1)
+    # at[a, b]: marker a under the label b, against all others; k = b itself goes elsewhere
+    at = torch.stack([(apart - row).clamp(min=0).square().nan_to_num(0.0).sum(-1) for row in reach], -1)
+    at = at - (apart - reach.diagonal()).clamp(min=0).square().nan_to_num(0.0)
+    after = rows.sum(-1)[:, None, None] / 2 - rows.unsqueeze(-1) - rows.unsqueeze(-2) + 2 * excess + at + at.mT
+    return _with_diagonal(after, rows.sum(-1) / 2)
+
+
+def _misfit(fitted: Float[Tensor, "b P 3"], z: Float[Tensor, "b P 3"]) -> Float[Tensor, "b P P"]:
+    """The squared distance (m^2) of measured from fitted markers after the labels of every two are exchanged."""
+    seen = (z.unsqueeze(2) - fitted.unsqueeze(1)).square().sum(-1)
+    own = seen.diagonal(dim1=-2, dim2=-1)
+    after = own.nansum(-1)[:, None, None] - own.unsqueeze(-1) - own.unsqueeze(-2) + seen + seen.mT
+    return _with_diagonal(after, own.nansum(-1))
+
+
+def _with_diagonal(after: Float[Tensor, "b P P"], now: Float[Tensor, " b"]) -> Float[Tensor, "b P P"]:
+    eye = torch.eye(after.shape[-1], dtype=torch.bool)
+    return torch.where(eye, now[:, None, None], after)
+
+
+def _exchanges(z: Float[Tensor, "b P 3"], cost: Callable[[Float[Tensor, "b P 3"]], Float[Tensor, "b P P"]]) -> Int[Tensor, "b P"]:
+    """Which measured marker to take for each label: exchanged two by two while that halves the cost."""
+    b, P = z.shape[:2]
+    order = torch.arange(P).expand(b, P).clone()
+    seen = torch.isfinite(z).all(-1)
+    for _ in range(MOST_EXCHANGES):
+        after = cost(z.gather(1, order.unsqueeze(-1).expand(-1, -1, 3)))
+        here = seen.gather(1, order)
+        after = torch.where(here.unsqueeze(-1) & here.unsqueeze(-2), after, torch.inf)
+        now = after.diagonal(dim1=-2, dim2=-1).amin(-1)
+        least, best = after.flatten(1).min(-1)
+        i, j = best // P, best % P
+        rows = (least < LOWERED * now).nonzero().squeeze(-1)
+        order[rows, i[rows]], order[rows, j[rows]] = order[rows, j[rows]], order[rows, i[rows]]
+    return order
+
+
+def _cycles(order: list[int]) -> tuple[Cycle, ...]:
+    """The groups that a permutation moves among themselves."""
+    left, found = {i for i, k in enumerate(order) if i != k}, []
+    while left:
+        cycle = [min(left)]
+        while order[cycle[-1]] != cycle[0]:
+            cycle.append(order[cycle[-1]])
+        left -= set(cycle)
+        found.append(tuple(sorted(cycle)))
+    return tuple(found)
+
+
+def _exchanged(
+    model: Model, markers: Markers, noise: float, residual: Float[Tensor, "b P 3"], chi2: Float[Tensor, " b"], settings: Settings
+) -> list[tuple[Cycle, ...]]:
+    """Per sample the groups of labels whose exchange makes the fit explain the markers far better."""
+    z = markers.positions
+    fitted = z - residual
+    best: Float[Tensor, " b"] = chi2.clone()
+    found: list[tuple[Cycle, ...]] = [()] * len(z)
+    for cost in (lambda z: _misfit(fitted, z), lambda z: _stretch(markers, z)):
+        order = _exchanges(z, cost)
+        index = (order != torch.arange(z.shape[1])).any(-1).nonzero().squeeze(-1)
+        index = index[[_cycles(order[b].tolist()) != found[b] for b in index.tolist()]]
+        if not len(index):
+            continue
+        part = markers.take(index)
+        part = replace(part, positions=part.positions.gather(1, order[index].unsqueeze(-1).expand(-1, -1, 3)))
+        other = estimate(model, part, noise, settings)
+        better = (other.status == int(Status.CONVERGED)) & (other.chi2 < LOWERED * best[index])
+        for b, row in zip(index[better].tolist(), order[index[better]].tolist(), strict=True):
+            found[b] = _cycles(row)
+        best[index[better]] = other.chi2[better]
+    return found
+
+
+def _bic(accepted: Bool[Tensor, " b"], chi2: Float[Tensor, " b"], model: Model, n: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+    """chi^2 + k ln(n) as in analysis.count, and a registration's numbers count as well; inf where not accepted."""
+    k = model.load_size - model.coordinates.informative_priors + 6 * model.registration
+    return torch.where(accepted, chi2 + k * torch.log(n), torch.inf)
+
+
+def _with_loads(model: Model, count: int) -> Model | None:
+    """The model with so many loads, where its loads are Gaussians at unknown places."""
+    coordinates = model.coordinates
+    if not isinstance(coordinates, GaussianCoordinates) or coordinates.locations is not None or count < 1:
+        return None
+    return replace(model, coordinates=replace(coordinates, count=count))
+
+
+def _explained(
+    model: Model, markers: Markers, noise: float, own: Float[Tensor, " b"], settings: Settings
+) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"]]:
+    """An error of the base frame, or that one more load, explains the markers: of the two and the fit (its BIC: own) the best.
+
+    A fit that is accepted, for which own is finite, may still have loads that a base frame with fewer would do without.
+    """
+    n, everyone, refused = (
+        3.0 * markers.present.sum(-1).clamp(min=1),
+        torch.arange(len(own)),
+        torch.isinf(own).nonzero().squeeze(-1),
+    )
+    zeta = torch.full((len(own), 6), torch.nan, dtype=torch.float64)
+    by_frame, by_load = torch.full_like(own, torch.inf), torch.full_like(own, torch.inf)
+    count = getattr(model.coordinates, "count", 0)
+    tried = [(model, refused)] + [(_with_loads(model, k), everyone) for k in {1, count - 1} - {count}]
+    for loads, index in tried if not model.registration else ():
+        moved = None if loads is None else replace(loads, registration=True)
+        if moved is None or not len(index) or 3 * len(markers.s) < moved.free_size:
+            continue
+        fit = estimate(moved, markers.take(index), noise, settings)
+        assert fit.registration is not None
+        shift, turn = fit.registration.split(3, -1)
+        small = (shift.norm(dim=-1) < TRANSLATION * model.robot.rod.length) & (turn.norm(dim=-1) < ROTATION)
+        score = torch.where(small, _bic(fit.accepted, fit.chi2, moved, n[index]), torch.inf)
+        zeta[index] = torch.where((score < by_frame[index]).unsqueeze(-1), fit.registration, zeta[index])
+        by_frame[index] = torch.minimum(by_frame[index], score)
+    more = _with_loads(model, count + 1)
+    if more is not None and len(refused) and 3 * len(markers.s) >= more.free_size:
+        fit = estimate(more, markers.take(refused), noise, settings)
+        by_load[refused] = _bic(fit.accepted, fit.chi2, more, n[refused])
+    best = torch.minimum(by_frame, torch.minimum(by_load, own - SURE))
+    framed = torch.isfinite(best) & (by_frame == best)
+    return torch.where(framed.unsqueeze(-1), zeta, torch.nan), torch.isfinite(best) & ~framed & (by_load == best)
+
+
+def _outliers(model: Model, markers: Markers, noise: float, settings: Settings) -> list[Cycle]:
+    """Per sample the few markers far off without which a robust fit explains the others."""
+    if math.isfinite(settings.robust) or not len(markers.positions):
+        return [()] * len(markers.positions)
+    fit = estimate(model, markers, noise, replace(settings, robust=ROBUST))
+    few = fit.outlier.sum(-1) <= FEW * markers.present.sum(-1)
+    told = fit.outlier & (fit.residual.norm(dim=-1) > CLEAR * noise) & (fit.accepted & few).unsqueeze(-1)
+    return [tuple(row.nonzero().flatten().tolist()) for row in told]
+
+
+def diagnose(
+    parts: Sequence[tuple[Model, Int[Tensor, " b"]]],
+    markers: Markers,
+    noise: float,
+    fit: Estimate,
+    settings: Settings | None = None,
+) -> Diagnosis:
+    """Look for the mistake behind every fit that does not explain its markers.
+
+    parts: of the batch, each with the model it was fitted by. Where there are several, the number of loads was chosen from the
+    data, and an error of the base frame may have passed for loads: accepted fits of two loads and more are looked at as well. Costs
+    a few more fits of these samples, and nothing for the others.
+    """
+    hasty = replace(settings or Settings(), restarts=(), max_iterations=ITERATIONS)
+    exchanged: list[tuple[Cycle, ...]] = [()] * len(fit.status)
+    registration = torch.full((len(fit.status), 6), torch.nan, dtype=torch.float64)
+    one_more, geometry = torch.zeros(len(fit.status), dtype=torch.bool), [""] * len(fit.status)
+    outliers: list[Cycle] = [()] * len(fit.status)
+    for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():
+        geometry[b] = misplaced(markers, b, parts[0][0].robot.rod.length)
+    richest = [model for model, _ in parts if 3 * len(markers.s) >= model.free_size][-1]
+    for model, index in parts:
+        chosen = len(parts) > 1 and model.load_size > 4
+        doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & usable(model, markers.take(index))
+        for rows in index[doubtful].split(CHUNK):
+            refused = rows[~fit.accepted[rows]]
+            found = _exchanged(model, markers.take(refused), noise, fit.residual[refused], fit.chi2[refused], hasty)
+            for b, cycles in zip(refused.tolist(), found, strict=True):
+                exchanged[b] = cycles
+            for b in [b for b in refused.tolist() if not exchanged[b]]:
+                geometry[b] = misplaced(markers, b, model.robot.rod.length)
+            rest = rows[[not (exchanged[b] or geometry[b]) for b in rows.tolist()]]
+            part, n = markers.take(rest), 3.0 * markers.present[rest].sum(-1)
+            own = _bic(fit.accepted[rest], fit.chi2[rest], model, n)
+            registration[rest], one_more[rest] = _explained(model, part, noise, own, hasty)
+            rest = rest[~fit.accepted[rest] & ~one_more[rest] & registration[rest].isnan().any(-1)]
+            for b, off in zip(rest.tolist(), _outliers(richest, markers.take(rest), noise, settings or Settings()), strict=True):
+                outliers[b] = off
+    return Diagnosis(markers.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers))

@@ -1,0 +1,123 @@
+"""Would one more load help, and where? A score test on the residual of a fit, and the start it suggests for a fit with that load.
+
+At a fit, add a point-like load at each of J places, with no force yet. With b the entries of the fitted state, c the two force
+components at one place, A = H^T W H + P and g = H^T W r + P (x0 - x), to first order in the new force
+
+    (1)  S = A_cc - A_cb A_bb^-1 A_bc            information on the force, everything else free
+    (2)  F = S^-1 (g_c - A_cb A_bb^-1 g_b)       the force that the residual asks for
+    (3)  drop = F^T S F                          by which the cost would fall: chi^2 with 2 degrees of freedom without a load there
+    (4)  x_b moves by A_bb^-1 (g_b - A_bc F)
+
+Source: Rao's score test (1948), in the information form of estimation.filter.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..estimation import filter as ekf
+from ..estimation.solve import linearize
+from ..estimation.starts import Start
+from ..mechanics.loads import GaussianLoads, Load
+from ..model.load_families import Gamma, GaussianCoordinates
+from ..model.load_families.base import logit
+from ..model.measurement import Markers, Model
+from ..util.precision import DTYPE
+
+PLACES = 16  # along the rod, evenly spaced up to the tip: closer than two pushes can be told apart
+BOLD = 3.0  # no force of a start is larger than this many force scales: (2) is linear
+
+
+@dataclass(frozen=True)
+class _Probing:
+    """The coordinates of a fit with point-like loads of zero force at fixed places behind them."""
+
+    fitted: GaussianCoordinates
+    places: tuple[float, ...]
+    informative_priors: int = 0
+
+    @property
+    def size(self) -> int:
+        return self.fitted.size + 2 * len(self.places)
+
+    def loads(self, gamma: Gamma) -> tuple[Load, ...]:
+        first = self.fitted.size
+        c = torch.full((len(self.places),), 0.5 / (self.fitted.length / 100) ** 2, dtype=DTYPE)
+        force = gamma[..., first:].unflatten(-1, (-1, 2)) * self.fitted.force_scale
+        mu = torch.tensor(self.places, dtype=DTYPE).expand(force.shape[:-1])
+        return (
+            *self.fitted.loads(gamma[..., :first]),
+            GaussianLoads(force * (c / torch.pi).sqrt().unsqueeze(-1), mu, c.expand_as(mu)),
+        )
+
+    def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        mean, precision = self.fitted.prior()
+        none = mean.new_zeros(2 * len(self.places))
+        return torch.cat([mean, none]), torch.cat([precision, none])
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Per sample, at the place that helps most: drop (B,) of the cost, force (B, 2) in force scales, eta (B,), and the fitted state
+    x (B, n) moved along with it.
+    """
+
+    drop: Float[Tensor, " B"]
+    force: Float[Tensor, "B 2"]
+    eta: Float[Tensor, " B"]
+    x: Float[Tensor, "B n"]
+
+    def take(self, index: Int[Tensor, " b"]) -> "Probe":
+        """The samples of an index."""
+        return Probe(self.drop[index], self.force[index], self.eta[index], self.x[index])
+
+
+def probe(model: Model, x: Float[Tensor, "B n"], markers: Markers, noise: float) -> Probe:
+    """The score test (1)-(4) at the fit x of `model`, whose coordinates must be Gaussians. noise: m."""
+    fitted = model.coordinates
+    assert isinstance(fitted, GaussianCoordinates)
+    L, n, g = fitted.length, model.size, fitted.size
+    places = tuple(L * (j + 1) / PLACES for j in range(PLACES))
+    wide = replace(model, coordinates=_Probing(fitted, places))
+    nothing = x.new_zeros(len(x), 2 * PLACES)
+    # With the tip condition as stiff as it is in truth: its slack would take up part of what a weak load does.
+    w = model.exact_weights(model.weights(markers, noise))
+    at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), markers, w)
+    c = torch.arange(g, g + 2 * PLACES)
+    b = torch.cat([torch.arange(g), torch.arange(g + 2 * PLACES, n + 2 * PLACES)])
+    A_bc = at.A[:, b][:, :, c]
+    both = ekf.solve_spd(at.A[:, b][:, :, b], torch.cat([A_bc, at.g[:, b].unsqueeze(-1)], -1))
+    A_cc = at.A[:, c][:, :, c] - A_bc.mT @ both[..., :-1]
+    g_c = at.g[:, c] - (A_bc.mT @ both[..., -1:]).squeeze(-1)
+    pair = 2 * torch.arange(PLACES).unsqueeze(-1) + torch.arange(2)
+    S = A_cc[:, pair.unsqueeze(-1), pair.unsqueeze(-2)]
+    F = ekf.solve_spd(S.flatten(0, 1), g_c[:, pair].flatten(0, 1).unsqueeze(-1)).squeeze(-1).unflatten(0, (-1, PLACES))
+    drop = (F * g_c[:, pair]).sum(-1).nan_to_num(0.0)
+    best = drop.argmax(-1)
+    return _at_best(best, drop, F, both, pair, x)
+
+
+def _at_best(
+    best: Int[Tensor, " B"], drop: Tensor, F: Tensor, both: Tensor, pair: Int[Tensor, "J 2"], x: Float[Tensor, "B n"]
+) -> Probe:
+    """The place of the largest drop of every sample, with (4)."""
+    rows = torch.arange(len(best))
+    force = F[rows, best].nan_to_num(0.0)
+    force = force * (BOLD / force.norm(dim=-1, keepdim=True).clamp(min=1e-12)).clamp(max=1.0)
+    columns = both[..., :-1].gather(-1, pair[best].unsqueeze(1).expand(-1, both.shape[1], -1))
+    moved = x + (both[..., -1] - (columns @ force.unsqueeze(-1)).squeeze(-1)).nan_to_num(0.0)
+    eta = torch.tensor([logit(min((j + 1) / PLACES, 0.98)) for j in range(PLACES)], dtype=DTYPE)
+    return Probe(drop[rows, best], force, eta[best], moved)
+
+
+def start_with_one_more(model: Model, found: Probe) -> Start:
+    """A start for `model`, which has one Gaussian load more than the fit that was probed."""
+    coordinates = model.coordinates
+    assert isinstance(coordinates, GaussianCoordinates)
+    g = coordinates.size - coordinates.per_load
+    log_c = coordinates.start()[-1].expand(len(found.eta))
+    more = torch.cat([found.force, torch.stack([found.eta, log_c], -1)], -1)
+    x = torch.cat([found.x[:, :g], more, found.x[:, g:]], -1)
+    return Start(x, None, torch.ones(len(x), dtype=torch.bool))

@@ -1,0 +1,50 @@
+"""Checks of arguments that several commands share. Each refusal is one sentence with the remedy."""
+
+import math
+import os
+from pathlib import Path
+
+from ..util.errors import InputError
+from ..util.files import writing
+
+FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+COARSEST = 0.25  # of the length: with more noise no shape shows
+
+
+def positive(name: str, value: float) -> None:
+    """Refuse what is not a positive number."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name} is {value}; it must be a positive number")
+
+
+def writable(path: str | None, suffixes: tuple[str, ...]) -> None:
+    """Refuse before the work, not after it."""
+    if path is None:
+        return
+    if Path(path).suffix not in suffixes:
+        raise InputError(f"{path}: cannot write this kind of file; let its name end in {' or '.join(suffixes)}")
+    with writing(path):
+        if not Path(os.path.realpath(path)).parent.is_dir():
+            raise InputError(f"{path}: its folder does not exist; create it first")
+        if Path(path).is_dir():
+            raise InputError(f"{path}: is a folder; give a file name")
+
+
+def noise_or_auto(value: str, length: float) -> float | None:
+    """A standard deviation of the markers (m) on a rod of this length (m); None for auto."""
+    if value == "auto":
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        raise InputError(f"--noise is {value}; it must be auto or a standard deviation in metres") from None
+    noise_std(number)
+    if number > COARSEST * length:
+        raise InputError(f"--noise is {value} m on a rod of {length:g} m; it is in metres: 1 mm is 1e-3")
+    return number
+
+
+def noise_std(value: float) -> None:
+    """Refuse a standard deviation of the markers that no tracker has."""
+    if not 1e-9 <= value <= 1:
+        raise InputError(f"--noise is {value}; it must be a standard deviation in metres, from 1e-9 to 1")

@@ -1,0 +1,79 @@
+"""What `torchrod calibrate` does, once its arguments are known."""
+
+import tomllib
+import warnings
+from pathlib import Path
+
+from jsonargparse import Namespace
+
+from ..analysis.calibration import Calibration
+from ..analysis.calibration import calibrate as run_calibration
+from ..analysis.unloaded_shapes import STIFFNESS
+from ..estimation.solve import Settings
+from ..io import CALIBRATION_SUFFIXES, Shapes, read_robot, read_shapes, unit_of, write_calibrated, write_calibration
+from ..mechanics.robot import Robot
+from ..util.errors import InputError
+from ..util.status import Status
+from .arguments import noise_std, positive, writable
+
+
+def calibrate(options: Namespace) -> None:
+    """torchrod calibrate."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*nothing hangs")  # the mass is what is sought
+        robot = read_robot(options.robot)
+    shapes = read_shapes(options.shapes, robot)
+    noise_std(options.noise)
+    positive("--max-iterations", options.max_iterations)
+    writable(options.out, (".toml",))
+    writable(options.json, CALIBRATION_SUFFIXES)
+    settings = Settings(max_iterations=options.max_iterations)
+    try:
+        found = run_calibration(robot, shapes.markers, options.noise, options.youngs_modulus, options.tension_offset, settings)
+    except ValueError as error:
+        raise InputError(f"{options.shapes}: {error}") from None
+    for name, used in zip(shapes.samples, found.used.tolist(), strict=True):
+        if not used:
+            warnings.warn(
+                f"{options.shapes}: sample {name} is left out: it has no markers, no finite tensions or no equilibrium",
+                stacklevel=2,
+            )
+    print(_report(found, shapes, options))  # noqa: T201
+    if options.json:
+        write_calibration(options.json, found, shapes.samples, robot.name, options.noise)
+    if options.out:
+        _write_robot(options, robot, found)
+
+
+def _write_robot(options: Namespace, robot: Robot, found: Calibration) -> None:
+    """The calibrated robot file; none where the calibration has nothing to say."""
+    if found.status is not Status.CONVERGED or found.undetermined:
+        warnings.warn(f"{options.out}: not written, because the values are not known; see the message", stacklevel=2)
+        return
+    factor = found.value(STIFFNESS, 1.0)
+    write_calibrated(options.out, options.robot, found.applied(robot), factor, options.tension_offset)
+
+
+def _rows(found: Calibration, path: str) -> list[tuple[str, float, float, float]]:
+    """Name with unit, before, after and standard deviation; a circular section's stiffness is shown as Young's modulus."""
+    modulus = tomllib.loads(Path(path).read_text(encoding="utf-8"))["rod"].get("youngs_modulus")
+    rows = []
+    for i, name in enumerate(found.names):
+        label, size = f"{name} ({unit_of(name)})", 1.0
+        if name == STIFFNESS and modulus is not None:
+            label, size = "youngs_modulus (Pa)", float(modulus)
+        rows.append((label, *(size * float(x[i]) for x in (found.before, found.values, found.std))))
+    return rows
+
+
+def _report(found: Calibration, shapes: Shapes, options: Namespace) -> str:
+    """The table on the screen, and how good the fit is."""
+    lines = [f"{'parameter':<24}{'before':>14}{'after':>14}{'+-':>12}"]
+    lines += [f"{label:<24}{before:>14.6g}{after:>14.6g}{std:>12.3g}" for label, before, after, std in _rows(found, options.robot)]
+    lines.append(
+        f"{int(found.used.sum())} of {len(shapes.samples)} samples, {found.iterations} iterations, rms residual "
+        f"{found.rms_residual * 1e3:.3f} mm, chi2/dof {found.chi2 / max(found.dof, 1):.3g}"
+    )
+    source = "the residuals, which are larger than --noise" if found.rescaled else f"--noise {options.noise:g} m"
+    lines.append(f"+- is one standard deviation, from {source}")
+    return "\n".join([*lines, found.message])

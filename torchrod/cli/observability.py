@@ -1,0 +1,152 @@
+"""What `torchrod observability` does, once its arguments are known."""
+
+import math
+import warnings
+from itertools import pairwise
+
+import torch
+from jsonargparse import Namespace
+from torch import Tensor
+
+from ..analysis.marker_placement import Placement, even_layout, place
+from ..analysis.observability import BENDS, LOCALIZED, Observability, bounds
+from ..io import read_robot, write_observability, write_observability_table
+from ..mechanics.robot import Robot
+from ..util.errors import InputError
+from ..util.precision import DTYPE
+from .arguments import FIGURE_SUFFIXES, noise_std, positive, writable
+
+DEFAULT_MARKERS = 20
+MOST_MARKERS = 200
+ROWS = 10  # of the table on the screen
+
+
+def observability(options: Namespace) -> None:
+    """torchrod observability."""
+    robot = read_robot(options.robot)
+    noise_std(options.noise)
+    force = robot.rod.force_scale if options.force is None else options.force
+    positive("--force", force)
+    tension = _tension(options, robot)
+    s = _layout(options, robot)
+    _check_place(options, robot)
+    writable(options.out, FIGURE_SUFFIXES)
+    writable(options.csv, (".csv",))
+    writable(options.json, (".json",))
+    placed = None
+    if options.place is not None:
+        try:
+            placed = place(robot, options.place, options.noise, force, tension, options.registration, options["from"], options.gap)
+        except ValueError as error:
+            raise InputError(f"{options.robot}: {error}") from None
+        s = placed.s
+    seen = bounds(robot, s, options.noise, force, tension=tension, registration=options.registration)
+    if bool(torch.isnan(seen.location_std).all()):
+        raise InputError(f"--force {force:g}: no equilibrium was found under it anywhere along the rod; check its size and units")
+    print(_report(robot, seen, s, options, placed))  # noqa: T201
+    _warn(seen)
+    if options.csv:
+        write_observability_table(options.csv, seen)
+    if options.json:
+        pulled = [] if tension is None else tension.tolist()
+        write_observability(options.json, seen, s.tolist(), robot.name, options.noise, pulled, options.registration, placed)
+    if options.out:
+        _draw(options, robot, seen, s, tension, placed)
+
+
+def _tension(options: Namespace, robot: Robot) -> Tensor | None:
+    given, tendons = options.tension or [], len(robot.tendons)
+    if len(given) != tendons:
+        raise InputError(f"--tension has {len(given)} values but the robot has {tendons} tendons; give one per tendon, in newtons")
+    if not all(math.isfinite(t) and t >= 0 for t in given):
+        raise InputError(f"--tension {given}: must be finite and at least 0 N")
+    return torch.tensor(given, dtype=DTYPE) if tendons else None
+
+
+def _layout(options: Namespace, robot: Robot) -> Tensor:
+    """The markers (m) of --at or --markers."""
+    L, least = robot.rod.length, 3 if options.registration else 2
+    if sum(option is not None for option in (options.at, options.markers, options.place)) > 1:
+        raise InputError("--markers, --at and --place each say where the markers are; give one of them")
+    if options.at is not None:
+        if any(not 0 < s <= L for s in options.at) or any(b <= a for a, b in pairwise(options.at)):
+            raise InputError(f"--at {options.at}: must increase and lie on the rod, above 0 and up to {L} m")
+        if len(options.at) < least:
+            raise InputError(f"--at has {len(options.at)} places; give at least {least}, or the push cannot be told from its place")
+        return torch.tensor(options.at, dtype=DTYPE)
+    name, count = ("--markers", options.markers) if options.place is None else ("--place", options.place)
+    count = DEFAULT_MARKERS if count is None else count
+    if not least <= count <= MOST_MARKERS:
+        why = " with --registration" if options.registration else ""
+        raise InputError(f"{name} is {count}; it must be from {least} to {MOST_MARKERS}{why}")
+    return even_layout(robot, count)
+
+
+def _check_place(options: Namespace, robot: Robot) -> None:
+    """Refuse --from and --gap that --place cannot use."""
+    L = robot.rod.length
+    if options.place is None:
+        for name in ("from", "gap"):
+            if options[name] is not None:
+                raise InputError(f"--{name} is for --place, which proposes markers; add --place N or leave it out")
+        return
+    if options["from"] is not None and not 0 < options["from"] < L:
+        raise InputError(f"--from is {options['from']}; it must lie on the rod, above 0 and below {L} m")
+    if options.gap is not None and not 0 <= options.gap <= L / options.place * (1 + 1e-9):
+        raise InputError(
+            f"--gap is {options.gap}; for {options.place} markers on {L} m it must be from 0 to {L / options.place:.6g} m"
+        )
+
+
+def _short(value: float, most: float = math.inf) -> str:
+    """A number of the table; what is beyond `most` says no more than that."""
+    if math.isnan(value):
+        return "no equilibrium"
+    if value > most:
+        return f"> {most:.4g}"
+    return f"{value:.4g}" if math.isfinite(value) else "none"
+
+
+def _report(robot: Robot, seen: Observability, s: Tensor, options: Namespace, placed: Placement | None) -> str:
+    """The table on the screen: the worst direction at about ten places."""
+    L, force = robot.rod.length, seen.force
+    lines = []
+    if placed is not None:
+        at = " ".join(f"{v:.6g}" for v in placed.s.tolist())
+        lines += [f"proposed markers (m): {at}"]
+        worst = [f"{_short(1e3 * v, 1e3 * L)} mm" for v in (placed.worst_even, placed.worst)]
+        asked = f"location of {force:.4g} N from {1e3 * placed.nearest:.4g} mm on, worst case"
+        lines += [f"{asked}: {worst[0]} evenly spaced, {worst[1]} proposed"]
+    lines += [f"{len(s)} markers, noise {options.noise:g} m, worst direction; +- is one standard deviation for {force:.4g} N"]
+    heads = ("s (mm)", "detected (N)", "located (N)", "force +- (N)", "location +- (mm)")
+    lines.append("".join(f"{head:>{18 if i else 8}}" for i, head in enumerate(heads)))
+    worst = [x.amax(-1) for x in (seen.detectable, seen.localizable, seen.magnitude_std, 1e3 * seen.location_std)]
+    for k in torch.linspace(0, len(seen.location) - 1, min(ROWS, len(seen.location))).round().int().tolist():
+        cells = [_short(float(x[k]), most) for x, most in zip(worst, (math.inf, math.inf, math.inf, 1e3 * L), strict=True)]
+        lines.append(f"{1e3 * float(seen.location[k]):>8.1f}" + "".join(f"{cell:>18}" for cell in cells))
+    lines.append(f"detected: found 95 % of the time, 5 % false alarms; located: standard deviation {LOCALIZED:.0%} of the length")
+    if bool(torch.isinf(seen.localizable).any()):
+        lines.append(f"none: not even where the push turns the rod by {BENDS[-1]:g} rad")
+    return "\n".join(lines)
+
+
+def _warn(seen: Observability) -> None:
+    """Say where there is nothing to say."""
+    lost = int(torch.isnan(seen.location_std).any(-1).sum())
+    if lost:
+        warnings.warn(f"no equilibrium was found under {seen.force:.4g} N at {lost} of {len(seen.location)} places", stacklevel=2)
+
+
+def _draw(
+    options: Namespace, robot: Robot, seen: Observability, s: Tensor, tension: Tensor | None, placed: Placement | None
+) -> None:
+    from ..plotting.observability import Layout, draw_observability
+
+    layouts = [Layout("proposed" if placed else "markers", s, seen)]
+    if placed is not None:
+        even = bounds(robot, placed.even, options.noise, seen.force, tension=tension, registration=options.registration)
+        layouts.append(Layout("evenly spaced", placed.even, even))
+    title = f"{robot.name}: {len(s)} markers, {1e3 * options.noise:g} mm noise"
+    title += f", tendons at {', '.join(f'{t:g}' for t in options.tension)} N" if tension is not None else ""
+    title += ", base frame unknown" if options.registration else ""
+    draw_observability(options.out, layouts, robot.rod.length, title, None if placed is None else placed.nearest)

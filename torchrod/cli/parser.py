@@ -1,0 +1,189 @@
+"""The command line. Nothing heavy is imported until a command runs, so that --help answers at once."""
+
+import importlib
+import importlib.metadata
+import sys
+import warnings
+from typing import NoReturn
+
+from jsonargparse import ArgumentParser, Namespace
+
+from ..util.errors import InputError
+
+
+class _Parser(ArgumentParser):
+    """Bad arguments are bad input: one line, exit status 2."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        hint = "see torchrod --help; files come before options that take several values"
+        raise InputError(f"{' '.join(str(message).split())} ({hint})") from ex
+
+
+def _number_list(parser: ArgumentParser, name: str, help: str, count: int | str = "+") -> None:
+    parser.add_argument(name, type=float, nargs=count, help=help)
+
+
+def _estimate_parser() -> ArgumentParser:
+    parser = _Parser(
+        description="Estimate where, which way and how hard a robot is pushed, from the measured positions of its markers."
+    )
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz: marker positions (m), base frame")
+    parser.add_argument("--contacts", type=str, default=None, help="number of loads (1), or auto: as many as the data ask for")
+    parser.add_argument(
+        "--load-prior",
+        type=str,
+        choices=["point", "contact", "distributed", "none", "auto"],
+        default="contact",
+        help="what is known of the width; auto: contact or distributed, as the data ask for",
+    )
+    parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
+    parser.add_argument("--robust", action="store_true", help="let markers far off weigh little, and name them")
+    parser.add_argument("--tension-std", type=float, default=None, help="std of the tensions' sensors (N); else exact")
+    parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
+    parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
+    parser.add_argument("--one-frame", action="store_true", help="with --registration: it is the same in all samples")
+    _number_list(
+        parser, "--frame-std", "with --registration: SHIFT TURN (m, rad), std of the error; 5 %% of the length, 10 degrees", 2
+    )
+    parser.add_argument(
+        "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
+    )
+    _number_list(parser, "--location", "known locations of the loads (m), one per load")
+    parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
+    parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
+    parser.add_argument("--steps", type=int, default=40, help="least number of arc-length steps")
+    parser.add_argument("--max-iterations", type=int, default=100, help="give a sample up after this many")
+    return parser
+
+
+def _calibrate_parser() -> ArgumentParser:
+    parser = _Parser(description="Mass per length of a robot, from shapes that nothing but gravity and its tendons bends.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml with gravity; its mass_per_length is the start, if positive")
+    parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz without external load, all of this robot")
+    parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
+    parser.add_argument("--youngs-modulus", action="store_true", help="also the stiffness, E and G together; needs tensions")
+    parser.add_argument("--tension-offset", action="store_true", help="also one offset (N) per tendon, added to its readings")
+    parser.add_argument("--out", type=str, default=None, help="CALIBRATED.toml: ROBOT.toml with the new values, comments kept")
+    parser.add_argument("--json", type=str, default=None, help="RESULT.json")
+    parser.add_argument("--max-iterations", type=int, default=100, help="give up after this many")
+    return parser
+
+
+def _observability_parser() -> ArgumentParser:
+    parser = _Parser(description="What markers will see of a push along the rod, before any measurement, and where to put them.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument("--markers", type=int, default=None, help="number of markers, evenly spaced, the last at the tip (20)")
+    _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
+    parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
+    parser.add_argument(
+        "--force", type=float, default=None, help="the push (N); by default one that bends the rod visibly, 4 EI/L^2"
+    )
+    _number_list(parser, "--tension", "tensions T1 T2 ... (N), one per tendon")
+    parser.add_argument("--registration", action="store_true", help="the base frame is not known either")
+    parser.add_argument("--place", type=int, default=None, help="propose places for so many markers, instead of --markers")
+    parser.add_argument("--from", type=float, default=None, help="with --place: the push nearest the base (m); 10 %% of the length")
+    parser.add_argument("--gap", type=float, default=None, help="with --place: least distance of markers (m); 2 %% of the length")
+    parser.add_argument("--out", type=str, default=None, help="FIGURE.png")
+    parser.add_argument("--csv", type=str, default=None, help="TABLE.csv")
+    parser.add_argument("--json", type=str, default=None, help="RESULT.json")
+    return parser
+
+
+def _simulate_parser() -> ArgumentParser:
+    parser = _Parser(description="The shape of a robot under known loads, as marker positions.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument(
+        "--point",
+        nargs=3,
+        action="append",
+        metavar=("S", "FX", "FY"),
+        help="a point force at S (m) of FX FY (N, section frame); repeatable",
+    )
+    _number_list(parser, "--tip-force", "X Y Z (N, base frame)", 3)
+    _number_list(parser, "--tip-moment", "X Y Z (N m, base frame)", 3)
+    _number_list(parser, "--tension", "tensions T1 T2 ... (N)")
+    _number_list(parser, "--displacement", "instead: how far each tendon is pulled out D1 D2 ... (m); a slack one carries nothing")
+    parser.add_argument("--markers", type=int, default=None, help="number of markers, evenly spaced, the last at the tip (20)")
+    _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
+    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to every coordinate (m)")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--out", type=str, required=True, help="SHAPE.csv")
+    return parser
+
+
+def _dataset_parser() -> ArgumentParser:
+    parser = _Parser(description="Shapes of random known loads, by the million: a folder of shards that can be resumed and shared.")
+    parser.add_argument("spec", type=str, help="DATASET.toml: robots, loads and markers to draw from")
+    parser.add_argument("--out", type=str, required=True, help="FOLDER; shards that are there and sound are kept")
+    parser.add_argument("--samples", type=int, default=None, help="number of samples, instead of the file's")
+    parser.add_argument("--seed", type=int, default=None, help="instead of the file's")
+    parser.add_argument("--shard", type=str, default=None, metavar="I/N", help="only shards I, I + N, ...: one of N jobs, I from 0")
+    parser.add_argument(
+        "--workers", type=int, default=None, help="processes on this machine; by default as many as torch has threads, one per core"
+    )
+    parser.add_argument("--scheduler", type=str, default=None, help="tcp://HOST:PORT of a dask cluster, instead of this machine")
+    return parser
+
+
+def _plot_parser() -> ArgumentParser:
+    parser = _Parser(description="Draw one sample of an estimate.")
+    parser.add_argument("robot", type=str, help="ROBOT.toml")
+    parser.add_argument("shapes", type=str, help="the shapes that were estimated")
+    parser.add_argument("result", type=str, help="RESULT.json or .npz of torchrod estimate")
+    parser.add_argument("--sample", type=str, default=None, help="which sample; the first by default")
+    parser.add_argument("--out", type=str, required=True, help="FIGURE.png")
+    return parser
+
+
+COMMANDS = {
+    "estimate": (_estimate_parser, "loads from marker positions"),
+    "calibrate": (_calibrate_parser, "mass per length from unloaded shapes"),
+    "observability": (_observability_parser, "what markers will see, and where to put them"),
+    "simulate": (_simulate_parser, "marker positions from known loads"),
+    "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
+    "plot": (_plot_parser, "a figure of an estimate"),
+}
+
+
+HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
+
+
+def _version() -> str:
+    """Of what is installed; a copy beside it that is not says so."""
+    try:
+        return importlib.metadata.version("torchrod")
+    except importlib.metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _parser() -> ArgumentParser:
+    about = "Forces from shape: the loads on a continuum robot from its measured markers."
+    parser = _Parser(prog="torchrod", description=about, version=_version())
+    commands = parser.add_subcommands(required=True)
+    for name, (make, help) in COMMANDS.items():
+        commands.add_subcommand(name, make(), help=help)
+    return parser
+
+
+def _run(options: Namespace) -> None:
+    name = options.subcommand
+    home = importlib.import_module(f".{HOMES.get(name, name)}", __package__)
+    getattr(home, name.replace("-", "_"))(options[name])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command `torchrod`. Exit status 0 when it did its work, 2 with one line on stderr for bad input."""
+
+    def one_line(message: Warning | str, *_: object) -> None:
+        print(f"torchrod: warning: {message}", file=sys.stderr)  # noqa: T201
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = one_line
+            _run(_parser().parse_args(arguments))
+    except InputError as error:
+        print(f"torchrod: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    return 0

@@ -1,0 +1,21 @@
+"""torchrod plot."""
+
+from jsonargparse import Namespace
+
+from ..io import read_fit, read_robot, read_shapes
+from ..util.errors import InputError
+from .arguments import FIGURE_SUFFIXES, writable
+
+
+def plot(options: Namespace) -> None:
+    """torchrod plot."""
+    from ..plotting.estimate import draw
+
+    robot = read_robot(options.robot)
+    shapes = read_shapes(options.shapes, robot)
+    sample = options.sample or shapes.samples[0]
+    if sample not in shapes.samples:
+        raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
+    writable(options.out, FIGURE_SUFFIXES)
+    fit = read_fit(options.result, sample, robot.name, len(shapes.markers.s))
+    draw(options.out, robot, fit, shapes.markers, shapes.samples.index(sample), f"{robot.name}, sample {sample}")

@@ -1,0 +1,183 @@
+// One arc-length step's right-hand side and its slope: the same operations as torchrod/mechanics/section.py and torchrod/mechanics/tendons.py, and their
+// derivative. The torch step is the definition; tests/test_fast.py and test_fit.py hold this copy to it, values and Jacobians.
+#pragma once
+
+#include "known.h"
+
+constexpr int MOST_TENDONS = 16;
+
+// All that is known at one stage, for the samples in the lanes.
+struct Stage {
+    bool Wn_there, Wm_there;
+    V3 G, Gm, Wn, Wm, u_star;
+    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
+};
+
+INLINE void inverse3(const V* A, V* R) {  // rows of R: cofactors of the columns of A
+    V c[9] = {A[4] * A[8] - A[7] * A[5], A[7] * A[2] - A[1] * A[8], A[1] * A[5] - A[4] * A[2],
+              A[5] * A[6] - A[8] * A[3], A[8] * A[0] - A[2] * A[6], A[2] * A[3] - A[5] * A[0],
+              A[3] * A[7] - A[6] * A[4], A[6] * A[1] - A[0] * A[7], A[0] * A[4] - A[3] * A[1]};
+    V one = 1.0 / (A[0] * c[0] + A[3] * c[1] + A[6] * c[2]);
+    for (int i = 0; i < 9; i++) R[i] = c[i] * one;
+}
+INLINE void product3(const V* P, const V* Q, V* R) {
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) R[3 * i + j] = P[3 * i] * Q[j] + P[3 * i + 1] * Q[3 + j] + P[3 * i + 2] * Q[6 + j];
+}
+
+// tendons.py, balance_inverse: by blocks [[A, B], [B^T, C]] with the Schur complement of A.
+INLINE void balance_inverse(const V* J, V* inverse) {
+    V A[9], B[9], S[9], Ainv[9], AinvB[9], D[9], E[9];
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) A[3 * i + j] = J[6 * i + j], B[3 * i + j] = J[6 * i + 3 + j], S[3 * i + j] = J[6 * (3 + i) + 3 + j];
+    inverse3(A, Ainv);
+    product3(Ainv, B, AinvB);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            for (int k = 0; k < 3; k++) S[3 * i + j] -= B[3 * k + i] * AinvB[3 * k + j];
+    inverse3(S, D);
+    product3(AinvB, D, E);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            V top = Ainv[3 * i + j];
+            for (int k = 0; k < 3; k++) top += E[3 * i + k] * AinvB[3 * j + k];
+            inverse[6 * i + j] = top;
+            inverse[6 * i + 3 + j] = inverse[6 * (3 + j) + i] = -E[3 * i + j];
+            inverse[6 * (3 + i) + 3 + j] = D[3 * i + j];
+        }
+}
+
+// The strains x that balance the wrench, the matrix of their last Newton step, and each tendon's wrench of unit tension.
+struct Balance {
+    V x[6], inverse[36], g[MOST_TENDONS * 6];
+};
+
+// tendons.py, balanced_strains: the values.
+inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
+    const V star[6] = {V{}, V{}, splat(1.0), at.u_star.c[0], at.u_star.c[1], at.u_star.c[2]};
+    for (int i = 0; i < 6; i++) b.x[i] = star[i];
+    for (int iteration = 0; iteration <= m.newton; iteration++) {
+        V misfit[6], J[36];
+        for (int i = 0; i < 36; i++) J[i] = V{};
+        for (int i = 0; i < 3; i++) {
+            misfit[i] = w[i], misfit[3 + i] = w[3 + i];
+            for (int j = 0; j < 3; j++) {
+                misfit[i] -= m.K_se[3 * i + j] * (b.x[j] - star[j]);
+                misfit[3 + i] -= m.K_bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
+                J[6 * i + j] = splat(m.K_se[3 * i + j]), J[6 * (3 + i) + 3 + j] = splat(m.K_bt[3 * i + j]);
+            }
+        }
+        for (int64_t t = 0; t < m.tendons; t++) {
+            const V* L = at.L + 18 * t;
+            V along[3], *g = b.g + 6 * t, square = V{};
+            for (int i = 0; i < 3; i++) {
+                along[i] = at.dr[3 * t + i];
+                for (int j = 0; j < 6; j++) along[i] += L[6 * i + j] * b.x[j];
+                square += along[i] * along[i];
+            }
+            V stretch = root(square);
+            for (int j = 0; j < 6; j++) g[j] = (L[j] * along[0] + L[6 + j] * along[1] + L[12 + j] * along[2]) / stretch;
+            for (int j = 0; j < 6; j++) misfit[j] -= at.tau[t] * g[j];
+            if (iteration == m.newton) continue;
+            V weight = at.tau[t] / stretch;
+            for (int i = 0; i < 6; i++)
+                for (int j = 0; j < 6; j++)
+                    J[6 * i + j] += weight * (L[i] * L[j] + L[6 + i] * L[6 + j] + L[12 + i] * L[12 + j] - g[i] * g[j]);
+        }
+        if (iteration < m.newton) balance_inverse(J, b.inverse);
+        V step[6];
+        for (int i = 0; i < 6; i++) {
+            step[i] = V{};
+            for (int j = 0; j < 6; j++) step[i] += b.inverse[6 * i + j] * misfit[j];
+        }
+        for (int i = 0; i < 6; i++) b.x[i] += step[i];
+    }
+}
+
+// What the derivative of one evaluation of (1)-(4) needs of its values. Jv (3, 4): of R v by q; Jn, Jm: of R^T Wn and R^T Wm.
+struct Slope {
+    V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS];
+    V3 q, u, v, N, N_turning, M_turning;
+    bool Jn_there, Jm_there;
+    Balance balance;
+};
+
+// step.py, derivative: (1)-(4). The parts of the wrench that turn with the section come first; what keeps its direction in the
+// base frame is added to them.
+inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope& s) {
+    s.q = part(y + 3), s.w = y[6];
+    s.N_turning = part(y + 7) - at.G;
+    s.M_turning = part(y + 10) - at.Gm;
+    s.M_turning.c[0] -= at.G2y;  // e3 x G2 = (-G2_y, G2_x, 0)
+    s.M_turning.c[1] += at.G2x;
+    const V3 back = V3{} - s.q;
+    s.N = s.N_turning, s.Jn_there = at.Wn_there, s.Jm_there = at.Wm_there;
+    V3 M = s.M_turning;
+    if (at.Wn_there) s.N = s.N + turned(back, s.w, at.Wn), turning(s.q, s.w, -1, at.Wn, s.Jn);
+    if (at.Wm_there) M = M + turned(back, s.w, at.Wm), turning(s.q, s.w, -1, at.Wm, s.Jm);
+    if (m.tendons) {
+        const V w[6] = {s.N.c[0], s.N.c[1], s.N.c[2], M.c[0], M.c[1], M.c[2]};
+        balance(m, at, w, s.balance);
+        s.v = part(s.balance.x), s.u = part(s.balance.x + 3);
+        for (int64_t t = 0; t < m.tendons; t++) s.tau_unit[t] = at.tau_unit[t];
+    } else {
+        s.v = matvec(m.K_se_inverse, s.N), s.u = at.u_star + matvec(m.K_bt_inverse, M);
+        s.v.c[2] += 1.0;
+    }
+    for (int k = 0; k < 3; k++) {
+        V3 axis{};
+        axis.c[k] = splat(1.0);
+        const V3 column = turned(s.q, s.w, axis);
+        for (int i = 0; i < 3; i++) s.R[3 * i + k] = column.c[i];
+    }
+    turning(s.q, s.w, 1, s.v, s.Jv);
+    // dp = R v, dq = q (u, 0) / 2, dN~ = -u x (N~ - G), dM~ = -u x (M - R^T Wm) - v x N - e3 x G
+    const V3 p = matvec(s.R, s.v), q = s.w * s.u + cross(s.q, s.u), N = cross(s.N_turning, s.u),
+             couple = cross(s.M_turning, s.u) + cross(s.N, s.v);
+    for (int i = 0; i < 3; i++) dy[i] = p.c[i], dy[3 + i] = 0.5 * q.c[i], dy[7 + i] = N.c[i], dy[10 + i] = couple.c[i];
+    dy[10] += at.G.c[1], dy[11] -= at.G.c[0];
+    dy[6] = -0.5 * dot(s.q, s.u);
+}
+
+// What moves with one tangent at one stage, beside the state: the local loads [G, G2_x, G2_y], Wn, and the tension of one tendon.
+struct Moves {
+    const V* local;   // (5) or null
+    const V3* Wn;     // or null
+    int64_t tension;  // whose unknown this tangent is, or -1
+};
+
+// The derivative of `derivative` along one tangent z of the state. Plain: no tendons and no loads of the base frame.
+template <bool Plain> INLINE void slope(const Known& m, const Slope& s, const V* z, const Moves& moves, V* dk) {
+    V3 dNt = part(z + 7), dMt = part(z + 10), shear{};
+    if (moves.local) {
+        const V* l = moves.local;
+        dNt = dNt - V3{l[0], l[1], l[2]};
+        dMt.c[0] -= l[4], dMt.c[1] += l[3];
+        shear = {l[1], -l[0], V{}};
+    }
+    V3 dN = dNt, dM = dMt, dv, du;
+    if (!Plain) {
+        if (moves.Wn) dN = dN + *moves.Wn;
+        if (s.Jn_there) dN = dN + matvec4(s.Jn, z + 3);
+        if (s.Jm_there) dM = dM + matvec4(s.Jm, z + 3);
+    }
+    if (!Plain && m.tendons) {
+        V dw[6] = {dN.c[0], dN.c[1], dN.c[2], dM.c[0], dM.c[1], dM.c[2]}, dx[6];
+        if (moves.tension >= 0)
+            for (int i = 0; i < 6; i++) dw[i] -= s.tau_unit[moves.tension] * s.balance.g[6 * moves.tension + i];
+        for (int i = 0; i < 6; i++) {
+            dx[i] = V{};
+            for (int k = 0; k < 6; k++) dx[i] += s.balance.inverse[6 * i + k] * dw[k];
+        }
+        dv = part(dx), du = part(dx + 3);
+    } else if (m.diagonal) {
+        for (int i = 0; i < 3; i++) dv.c[i] = m.K_se_inverse[4 * i] * dN.c[i], du.c[i] = m.K_bt_inverse[4 * i] * dM.c[i];
+    } else {
+        dv = matvec(m.K_se_inverse, dN), du = matvec(m.K_bt_inverse, dM);
+    }
+    const V3 dq = part(z + 3), p = matvec(s.R, dv) + matvec4(s.Jv, z + 3), q = s.w * du + z[6] * s.u + cross(dq, s.u) + cross(s.q, du),
+             N = cross(dNt, s.u) + cross(s.N_turning, du),
+             M = cross(dMt, s.u) + cross(s.M_turning, du) + cross(dN, s.v) + cross(s.N, dv) + shear;
+    for (int i = 0; i < 3; i++) dk[i] = p.c[i], dk[3 + i] = 0.5 * q.c[i], dk[7 + i] = N.c[i], dk[10 + i] = M.c[i];
+    dk[6] = -0.5 * (dot(dq, s.u) + dot(s.q, du));
+}

@@ -1,0 +1,164 @@
+"""Actuation by displacement: the tensions at which the path of every tendon has the length that its motor leaves it.
+
+A tendon that does not stretch, of which d has been pulled out of the robot, leaves A = l0 - d of path (l0: in the reference shape).
+It cannot push, so that with l(tau) the length of its path in equilibrium
+
+    (1)  0 <= tau,   0 <= A - l(tau),   tau (A - l(tau)) = 0        (taut with some tension, or slack with none)
+
+for all tendons together. Solved by a primal-dual active set with Newton steps: taut are those with tau - k (A - l) > 0.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..util.status import Status
+from .grid import DEFAULT_STEPS
+from .lie import rotate
+from .loads import Load
+from .robot import Robot
+from .statics import Equilibrium, solve_shape
+from .tendons import Tendons
+
+CHORDS = 32  # per tendon; the sum of chords is extrapolated from 16 and 32 (Richardson), which leaves about 1e-9 of the length
+LENGTH_TOLERANCE = 1e-9  # of the path, relative to the rod's length
+MAX_ITERATIONS = 30
+PROBE = 1e-3  # relative change of tension by which the first Jacobian is differenced
+
+
+@dataclass(frozen=True)
+class Actuated:
+    """equilibrium: the robot's shape. slack (B, T): which tendons carry nothing; path (B, T) m: their lengths.
+
+    tension (B, T) N: what the tendons carry; a load cell reads `tension_offset` less.
+    """
+
+    equilibrium: Equilibrium
+    tension: Float[Tensor, "B T"]
+    slack: Bool[Tensor, "B T"]
+    path: Float[Tensor, "B T"]
+
+
+def _stations(robot: Robot) -> Float[Tensor, "T n"]:
+    """Arc lengths (m) at which each tendon's path is sampled."""
+    ends = torch.tensor(robot.tendons.ends, dtype=torch.float64)
+    return ends.unsqueeze(-1) * torch.linspace(0, 1, CHORDS + 1, dtype=torch.float64)
+
+
+def _path_lengths(robot: Robot, stations: Float[Tensor, "T n"], shape: Equilibrium) -> Float[Tensor, "B T"]:
+    """l_j = integral of |v + u x r_j + r_j'| ds (m), as the length of the curve p(s) + R(s) r_j(s).
+
+    Chords miss the arc by c h^2 + O(h^4): 4/3 of the fine sum less 1/3 of the coarse one has no c. shape: sampled at the stations
+    of every tendon, one after the other, behind whatever else was asked for.
+    """
+    first = shape.p.shape[1] - stations.numel()
+    p, q = (x[:, first:].unflatten(1, stations.shape) for x in (shape.p, shape.q))
+    r = torch.stack([t.offset_at(s)[0] for t, s in zip(robot.tendons.tendons, stations, strict=True)])
+    curve = p + rotate(q, r)
+    fine = curve.diff(dim=2).norm(dim=-1).sum(-1)
+    coarse = curve[:, :, ::2].diff(dim=2).norm(dim=-1).sum(-1)
+    return (4 * fine - coarse) / 3
+
+
+def reference_lengths(robot: Robot) -> Float[Tensor, " T"]:
+    """l0 (m): every tendon's path in the unloaded robot without gravity or tension."""
+    stations = _stations(robot)
+    none = torch.zeros(1, len(robot.tendons), dtype=torch.float64)
+    weightless = Robot(robot.rod, robot.tendons, torch.zeros_like(robot.gravity.reshape(-1, 3)[0]))
+    return _path_lengths(robot, stations, solve_shape(weightless, (), none, stations.flatten(), 1))[0]
+
+
+def solve_displacement(
+    robot: Robot,
+    loads: tuple[Load, ...],
+    displacement: Float[Tensor, "B T"],
+    outputs: Float[Tensor, " P"],
+    steps: int = DEFAULT_STEPS,
+) -> Actuated:
+    """The shape of B samples under known loads with d (m) of each tendon pulled out, and the tensions that this takes (1).
+
+    d < 0 pays tendon out: it goes slack unless something else stretches its path. Loads as in solve_shape; outputs in m.
+    Errors: ValueError for a robot without tendons or d of another shape; a sample that cannot be solved has status NOT_CONVERGED.
+    """
+    B, T = displacement.shape
+    if len(robot.tendons) != T or not T:
+        raise ValueError(f"{T} displacements for {len(robot.tendons)} tendons; give one per tendon")
+    # The load cells' offsets belong to readings; here the unknowns are the tensions themselves.
+    robot = replace(robot, tendons=Tendons(tuple(replace(t, tension_offset=0.0) for t in robot.tendons.tendons)))
+    stations = _stations(robot)
+    allowed = reference_lengths(robot) - displacement
+    places = torch.cat([outputs, stations.flatten()])
+
+    def solved(tension: Float[Tensor, "B T"]) -> tuple[Equilibrium, Float[Tensor, "B T"]]:
+        shape = solve_shape(robot, loads, tension, places, B, steps)
+        return shape, allowed - _path_lengths(robot, stations, shape)
+
+    # k (N/m): the tension that bends a straight rod so far that a path a metre long is a metre shorter.
+    reach = torch.stack([t.offset_at(s)[0].square().sum(-1).mean() for t, s in zip(robot.tendons.tendons, stations, strict=True)])
+    k = robot.rod.bending_stiffness / (reach * stations[:, -1])
+    tension = (k * displacement).clamp(min=0.0)
+    shape, gap = solved(tension)
+    slope = _slope(solved, tension, gap, PROBE * k * robot.rod.length)
+    live = torch.ones(B, dtype=torch.bool)
+    for _ in range(MAX_ITERATIONS):
+        taut = tension - k * gap > 0
+        off = torch.where(taut, gap, tension / k).abs().amax(-1)
+        live = off > LENGTH_TOLERANCE * robot.rod.length
+        if not bool(live.any()):
+            break
+        step = torch.where(live.unsqueeze(-1), _step(tension, gap, taut, slope), 0.0)
+        shape, after = solved(tension + step)
+        slope = _secant(slope, step, after - gap)
+        tension, gap = tension + step, after
+    return _actuated(shape, tension, allowed - gap, live, len(outputs))
+
+
+def _slope(solved, tension: Float[Tensor, "B T"], gap: Float[Tensor, "B T"], by: Float[Tensor, " T"]) -> Float[Tensor, "B T T"]:
+    """d gap / d tension by forward differences of the forward solve: pulling makes the path shorter and the gap larger."""
+    columns = []
+    for j, e in enumerate(torch.eye(len(by), dtype=tension.dtype) * by):
+        columns.append((solved(tension + e)[1] - gap) / by[j])
+    return torch.stack(columns, -1)
+
+
+def _step(
+    tension: Float[Tensor, "B T"], gap: Float[Tensor, "B T"], taut: Bool[Tensor, "B T"], slope: Float[Tensor, "B T T"]
+) -> Float[Tensor, "B T"]:
+    """Newton on (1): slack tendons let go of their tension, and the gaps of the taut ones close; no tension falls below zero."""
+    eye = torch.eye(tension.shape[-1], dtype=tension.dtype)
+    A = torch.where(taut.unsqueeze(-1), slope, eye)
+    b = torch.where(taut, -gap, -tension)
+    step = torch.linalg.solve_ex(A, b.unsqueeze(-1))[0].squeeze(-1).nan_to_num(0.0)
+    return (tension + step).clamp(min=0.0) - tension
+
+
+def _secant(slope: Float[Tensor, "B T T"], step: Float[Tensor, "B T"], change: Float[Tensor, "B T"]) -> Float[Tensor, "B T T"]:
+    """Broyden's rank-one update: the slope that would have foretold the last change."""
+    missed = change - (slope @ step.unsqueeze(-1)).squeeze(-1)
+    size = step.square().sum(-1, keepdim=True)
+    correction = missed.unsqueeze(-1) * (step / size.clamp(min=1e-30)).unsqueeze(-2)
+    return slope + torch.where((size > 1e-24).unsqueeze(-1), correction, 0.0).nan_to_num(0.0)
+
+
+def _actuated(
+    shape: Equilibrium, tension: Float[Tensor, "B T"], path: Float[Tensor, "B T"], live: Bool[Tensor, " B"], P: int
+) -> Actuated:
+    """The answer at the outputs that were asked for; a sample whose tensions did not settle is NOT_CONVERGED and holds NaN."""
+    failed = live | (shape.status != int(Status.CONVERGED))
+    status = torch.where(live & (shape.status == int(Status.CONVERGED)), int(Status.NOT_CONVERGED), shape.status)
+
+    def kept(x: Tensor) -> Tensor:
+        return torch.where(failed.reshape(-1, *[1] * (x.ndim - 1)), torch.nan, x)
+
+    equilibrium = Equilibrium(
+        shape.s[:P],
+        kept(shape.p[:, :P]),
+        kept(shape.q[:, :P]),
+        kept(shape.base_wrench),
+        status,
+        shape.residual,
+        shape.iterations,
+    )
+    return Actuated(equilibrium, kept(tension), tension <= 0, kept(path))

@@ -1,0 +1,45 @@
+"""The robot: a rod, its tendons and gravity."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..util.kept import versions
+from ..util.precision import DTYPE, Float64
+from .lie import Vector
+from .loads import LoadIntegrals
+from .rod import Rod
+from .tendons import Tendons
+
+
+@dataclass(frozen=True)
+class Robot(Float64):
+    """A rod with tendons in a gravity field. gravity: (3,) or (B, 3), m/s^2, base frame."""
+
+    rod: Rod
+    tendons: Tendons = field(default_factory=Tendons)
+    gravity: Vector = field(default_factory=lambda: torch.zeros(3, dtype=DTYPE))
+    name: str = "rod"
+
+    @property
+    def versions(self) -> tuple[int, ...]:
+        """Others when a tensor of the robot has been changed in place: what is kept of it no longer holds then."""
+        return versions(self.gravity, *vars(self.rod).values())
+
+    @property
+    def weight(self) -> Vector:
+        """Gravity force per length (..., 3), N/m, base frame."""
+        return self.rod.mass_per_length.unsqueeze(-1) * self.gravity
+
+    @property
+    def weightless(self) -> bool:
+        """True where gravity plays no part."""
+        return not bool((self.weight != 0).any())
+
+    def weight_beyond(self, s: Float[Tensor, "... S 3"]) -> LoadIntegrals:
+        """Wn(s) = rho g (L - s) (N, base frame): the weight that hangs beyond s."""
+        if self.weightless:
+            return LoadIntegrals()
+        return LoadIntegrals(Wn=self.weight[..., None, None, :] * (self.rod.length - s).unsqueeze(-1))

@@ -1,0 +1,187 @@
+"""Tendons: where they run in the section, where they end, and the strains they leave for the rod to carry."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..util.precision import DTYPE
+from .lie import Matrix, Vector, hat, inverse3, matvec
+
+# Stiff rods: values to round-off and derivatives to 1e-9 (with two steps 1e-12 and only 1e-5). One more, differentiated, follows.
+NEWTON_STEPS = 3
+NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stiffness
+SOFT = 0.1  # this much of it
+SETTLED = 1e-7  # relative change of the strains that further steps may still make
+Strains = Float[Tensor, "... 6"]
+
+
+@dataclass(frozen=True)
+class Tendon:
+    """One frictionless tendon of uniform tension.
+
+    routing: rows [s, x, y] (m): its offset from the centre line in the section frame; one row is a straight tendon, more rows
+    are joined by a C2 cubic spline in s. ends_at: arc length (m) at which it is fixed to the rod.
+    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`).
+    """
+
+    routing: tuple[tuple[float, float, float], ...]
+    ends_at: float
+    tension_offset: float = 0.0
+
+    @classmethod
+    def straight(cls, x: float, y: float, ends_at: float, tension_offset: float = 0.0) -> "Tendon":
+        """A tendon parallel to the centre line at offset (x, y) (m)."""
+        return cls(((0.0, x, y),), ends_at, tension_offset)
+
+    def offset_at(self, s: Float[Tensor, "..."]) -> tuple[Vector, Vector]:
+        """r(s) (m) and r'(s) (-), section frame, third component zero; s may carry derivatives (moving nodes)."""
+        rows = np.asarray(self.routing)
+        zero = s.new_zeros(*s.shape, 1)
+        if len(self.routing) == 1:
+            return torch.cat([torch.from_numpy(rows[0, 1:]).expand(*s.shape, 2), zero], -1), torch.cat([zero, zero, zero], -1)
+        from scipy.interpolate import CubicSpline  # a third of a second, for routings that need it
+
+        spline = CubicSpline(rows[:, 0], rows[:, 1:])
+        knots, c = torch.from_numpy(spline.x), torch.from_numpy(spline.c)
+        piece = (torch.searchsorted(knots, s.detach().contiguous(), right=True) - 1).clamp(0, len(knots) - 2)
+        t, (c3, c2, c1, c0) = (s - knots[piece]).unsqueeze(-1), c[:, piece]
+        r, dr = ((c3 * t + c2) * t + c1) * t + c0, (3 * c3 * t + 2 * c2) * t + c1
+        return torch.cat([r, zero], -1), torch.cat([dr, zero], -1)
+
+
+@dataclass(frozen=True)
+class TendonTable:
+    """Every tendon at given arc lengths, for strains x = [v, u] (..., 6).
+
+    along_j = L_j x + r'_j with L_j = [I, -hat(r_j)]: L (..., T, 3, 6), dr (..., T, 3); tau (..., T) N, zero past a tendon's end.
+    newton: how many steps the strain balance takes.
+    """
+
+    L: Float[Tensor, "... T 3 6"]
+    dr: Float[Tensor, "... T 3"]
+    tau: Float[Tensor, "... T"]
+    newton: int = NEWTON_STEPS
+
+
+@dataclass(frozen=True)
+class Tendons:
+    """The robot's tendons; an empty tuple is a passive rod."""
+
+    tendons: tuple[Tendon, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.tendons)
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """Arc lengths (m) at which tendons end: step boundaries of the integration."""
+        return tuple(t.ends_at for t in self.tendons)
+
+    def true_tension(self, reading: Float[Tensor, "... T"], clamped: bool = True) -> Float[Tensor, "... T"]:
+        """tau = max(reading + tension_offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
+        tau = reading + torch.tensor([t.tension_offset for t in self.tendons], dtype=DTYPE)
+        return tau.clamp(min=0.0) if clamped else tau
+
+    def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
+        """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""
+        reach = max(max(x * x + y * y for _, x, y in t.routing) for t in self.tendons)
+        pulls = tension.detach().nan_to_num(0.0).sum(-1)
+        pull = pulls.max() if pulls.numel() else pulls.new_zeros(())
+        ratio = pull / K_se.diagonal(dim1=-2, dim2=-1).min() + pull * reach / K_bt.diagonal(dim1=-2, dim2=-1).min()
+        return NEWTON_STEPS if bool(ratio < SOFT) else NEWTON_STEPS_SOFT
+
+    def table(
+        self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."], tension: Float[Tensor, "..."], newton: int = NEWTON_STEPS
+    ) -> TendonTable:
+        """Offsets and tensions at s; `inside` is a point of the same step and decides on which side of a tendon's end s lies."""
+        offsets = [t.offset_at(s) for t in self.tendons]
+        r, dr = torch.stack([r for r, _ in offsets], -2), torch.stack([dr for _, dr in offsets], -2)
+        active = inside.detach().unsqueeze(-1) < torch.tensor(self.ends, dtype=DTYPE)
+        L = torch.cat([torch.eye(3, dtype=DTYPE).expand(*r.shape, 3), -hat(r)], -1)
+        return TendonTable(L, dr, tension * active, newton)
+
+
+def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "... T 6"], Float[Tensor, "... T 1"]]:
+    """g_j = L_j^T t_j, the wrench of unit tension [t_j, r_j x t_j] (-, m), and the stretch |along_j|, with
+
+        t_j = (v + u x r_j + r_j') / |.|
+
+    so that the tendons' wrench on their side of the section is sum_j tau_j g_j. Source: docs/model.md; Rucker & Webster 2011.
+    """
+    along = (table.L * x[..., None, None, :]).sum(-1) + table.dr
+    stretch = (along * along).sum(-1, keepdim=True).sqrt()
+    return (table.L * (along / stretch).unsqueeze(-1)).sum(-2), stretch
+
+
+def balance_inverse(
+    K_se: Matrix,
+    K_bt: Matrix,
+    tau: Float[Tensor, "... T"],
+    LtL: Float[Tensor, "... T 6 6"],
+    g: Float[Tensor, "... T 6"],
+    stretch: Float[Tensor, "... T 1"],
+) -> Float[Tensor, "... 6 6"]:
+    """Inverse (..., 6, 6) of the Hessian of strain energy plus tendon energy, symmetric positive definite,
+
+        diag(K_se, K_bt) + sum_j (tau_j / stretch_j) (L_j^T L_j - g_j g_j^T)
+
+    by 3 x 3 blocks [[A, B], [B^T, C]] with the Schur complement of A.
+    """
+    weight = (tau.unsqueeze(-1) / stretch).unsqueeze(-1)
+    J = (weight * (LtL - g.unsqueeze(-1) * g.unsqueeze(-2))).sum(-3)
+    A, B, C = K_se + J[..., :3, :3], J[..., :3, 3:], K_bt + J[..., 3:, 3:]
+    Ainv = inverse3(A)
+    AinvB = (Ainv.unsqueeze(-1) * B.unsqueeze(-3)).sum(-2)
+    D = inverse3(C - (B.unsqueeze(-1) * AinvB.unsqueeze(-2)).sum(-3))
+    E = -(AinvB.unsqueeze(-1) * D.unsqueeze(-3)).sum(-2)
+    top = Ainv - (E.unsqueeze(-2) * AinvB.unsqueeze(-3)).sum(-1)
+    return torch.cat([torch.cat([top, E], -1), torch.cat([E.transpose(-1, -2), D], -1)], -2)
+
+
+def balanced_strains(
+    K_se: Matrix, K_bt: Matrix, v_star: Vector, u_star: Vector, N: Vector, M: Vector, table: TendonTable
+) -> tuple[Vector, Vector]:
+    """Strains v (-), u (1/m) that carry the whole section's wrench N (N), M (N m), all in the section frame:
+
+        N = K_se (v - v*) + sum_j tau_j t_j(v, u),    M = K_bt (u - u*) + sum_j tau_j r_j x t_j(v, u)
+
+    Newton on the convex energy from the unstrained section. Only the last step is differentiated, with its matrix held fixed:
+    exact, because dx = -J^-1 dF at the solution, and cheap. Source: docs/model.md.
+    """
+    x_star = torch.cat([v_star.expand_as(u_star), u_star], -1)
+
+    def misfit(
+        x: Strains, w: Strains, g: Float[Tensor, "... T 6"], tau: Float[Tensor, "... T"], K_se: Matrix, K_bt: Matrix
+    ) -> Strains:
+        elastic = x - x_star
+        rod = torch.cat([matvec(K_se, elastic[..., :3]), matvec(K_bt, elastic[..., 3:])], -1)
+        return w - rod - (tau.unsqueeze(-1) * g).sum(-2)
+
+    w = torch.cat([N, M], -1)
+    w0, K_se0, K_bt0 = w.detach(), K_se.detach(), K_bt.detach()
+    frozen = TendonTable(table.L, table.dr, table.tau.detach(), table.newton)
+    LtL = (table.L.unsqueeze(-1) * table.L.unsqueeze(-2)).sum(-3)
+    x, inverse = x_star, x_star
+    for _ in range(table.newton):
+        g, stretch = tendon_directions(x, frozen)
+        inverse = balance_inverse(K_se0, K_bt0, frozen.tau, LtL, g, stretch)
+        x = x + (inverse * misfit(x, w0, g, frozen.tau, K_se0, K_bt0).unsqueeze(-2)).sum(-1)
+    g, _ = tendon_directions(x, frozen)
+    x = x + (inverse * misfit(x, w, g, table.tau, K_se, K_bt).unsqueeze(-2)).sum(-1)
+    return x[..., :3], x[..., 3:]
+
+
+def strains_settled(
+    K_se: Matrix, K_bt: Matrix, v_star: Vector, u_star: Vector, N: Vector, M: Vector, table: TendonTable | None
+) -> Bool[Tensor, "..."]:
+    """Whether further Newton steps would leave the strains where they are: false where the tendons crush the rod (no solution)."""
+    if table is None:
+        return torch.isfinite(N).all(-1)
+    once, again = (
+        torch.cat(balanced_strains(K_se, K_bt, v_star, u_star, N, M, t), -1)
+        for t in (table, replace(table, newton=table.newton + NEWTON_STEPS_SOFT))
+    )
+    return ((once - again).norm(dim=-1) <= SETTLED * again.norm(dim=-1)) & (again[..., 2] > 0)

@@ -1,0 +1,76 @@
+"""What every parameterization of the loads supplies to the filter."""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ...mechanics.loads import Load
+
+Gamma = Float[Tensor, "... n"]
+
+ETA_OF_RESTART = 3.0  # S(3) = 0.95
+WEAK_STD = 10.0  # of the priors that only keep unobservable directions finite (a load of no force has no location)
+
+
+@dataclass(frozen=True)
+class LoadReport:
+    """What a person asks for, one entry per load: force (..., K, 2) N (section frame), location (..., K) m, width (..., K) m.
+
+    location is the centroid parameter mu or the point of application, width the Gaussian's sigma (0 for a point force). net_force
+    is the paper's (13), which counts what hangs over the tip; force is what acts on the rod.
+    """
+
+    force: Float[Tensor, "... K 2"]
+    location: Float[Tensor, "... K"]
+    width: Float[Tensor, "... K"]
+    net_force: Float[Tensor, "... K 2"]
+
+
+@runtime_checkable
+class LoadCoordinates(Protocol):
+    """What every parameterization supplies."""
+
+    @property
+    def size(self) -> int:
+        """The number of entries of gamma."""
+        ...
+
+    def loads(self, gamma: Gamma) -> tuple[Load, ...]:
+        """The loads that gamma means."""
+        ...
+
+    def start(self) -> Float[Tensor, " n"]:
+        """A cold start."""
+        ...
+
+    def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Mean and precision of each entry."""
+        ...
+
+    @property
+    def informative_priors(self) -> int:
+        """How many prior entries count as data in the chi-square test."""
+        ...
+
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """The same loads with other magnitudes: where to try again when a fit is not accepted."""
+        ...
+
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma moved by a draw `step` of its uncertainty, along curves on which the posterior is most nearly Gaussian.
+
+        gamma + step to first order; std: the standard deviation of every entry.
+        """
+        ...
+
+    def describe(self, gamma: Gamma) -> LoadReport:
+        """Force, location and width of each load."""
+        ...
+
+
+def logit(t: float) -> float:
+    """The inverse of the sigmoid."""
+    return math.log(t / (1 - t))

@@ -1,0 +1,63 @@
+"""A distributed load as a Fourier series."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...mechanics.loads import FourierLoads, Load
+from ...util.precision import DTYPE
+from .base import WEAK_STD, Gamma, LoadReport
+
+
+@dataclass(frozen=True)
+class FourierCoordinates:
+    """A Fourier series (12) of `periods` periods: [a_0..a_K, b_1..b_K] for x, then for y, in units of force scale / L.
+
+    force_std: standard deviation of each coefficient's prior about zero, in those units; weak by default.
+    """
+
+    periods: int
+    length: float
+    force_scale: float
+    force_std: float = WEAK_STD
+    informative_priors: int = 0
+
+    @property
+    def size(self) -> int:
+        """2 (2 K + 1): 14 for three periods."""
+        return 2 * (2 * self.periods + 1)
+
+    def loads(self, gamma: Gamma) -> tuple[Load, ...]:
+        """One FourierLoads."""
+        each = gamma.unflatten(-1, (2, -1)) * (self.force_scale / self.length)
+        return (FourierLoads(each[..., : self.periods + 1], each[..., self.periods + 1 :], self.length),)
+
+    def start(self) -> Float[Tensor, " n"]:
+        """No load."""
+        return torch.zeros(self.size, dtype=DTYPE)
+
+    def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Zero +- force_std in every coefficient."""
+        return self.start(), torch.full((self.size,), self.force_std**-2, dtype=DTYPE)
+
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """Coefficients times the factor."""
+        return factor * gamma
+
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma + step: the density is linear in the coefficients."""
+        return gamma + step
+
+    def describe(self, gamma: Gamma) -> LoadReport:
+        """The whole series as one load: its net force, its centroid (by |f|) and the spread about it."""
+        (load,) = self.loads(gamma)
+        s = torch.linspace(0.0, self.length, 201, dtype=DTYPE)
+        density = load.density(s)
+        assert density is not None
+        weight = density.square().sum(-1).clamp(min=1e-300).sqrt()
+        centroid = (weight * s).sum(-1) / weight.sum(-1)
+        spread = ((weight * (s - centroid.unsqueeze(-1)) ** 2).sum(-1) / weight.sum(-1)).sqrt()
+        net = torch.trapezoid(density[..., :2], s, dim=-2).unsqueeze(-2)
+        return LoadReport(net, centroid.unsqueeze(-1), spread.unsqueeze(-1), net)

@@ -1,0 +1,129 @@
+"""The default parameterization: Gaussian loads by their net force, location and log width."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...mechanics.loads import GaussianLoads, Load, on_rod_fraction
+from ...util.precision import DTYPE
+from .base import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
+
+WIDTH_OF_PRIOR = {"point": 1 / 100, "contact": 1 / 40, "distributed": 1 / 4}  # sigma / L: 4, 10 and 100 mm on the paper's rod
+LOG_C_STD = 1.0  # of the weak prior on log c
+KNOWN = 0.5  # a force or a place with less relative error than this is known well enough for its logarithm to have one
+SPREAD_LIMIT = 10.0  # of log |F|: what is drawn beyond it is not used, and must not overflow
+
+
+@dataclass(frozen=True)
+class GaussianCoordinates:
+    """The default: per load [F_x, F_y, eta, log(c L^2)], F the net force on the rod in units of the rod's force scale.
+
+    mu = L S(eta), S the logistic function (11). The amplitude is a = F / (sqrt(pi / c) x fraction of the Gaussian on the rod), so F
+    stays what the rod feels when the Gaussian hangs over the tip, where (13) does not. A known location leaves eta out.
+    force_std: standard deviation of each force component's prior about zero, in force scales; weak by default.
+    """
+
+    count: int
+    length: float
+    force_scale: float
+    prior_name: str = "contact"
+    locations: tuple[float, ...] | None = None
+    force_std: float = WEAK_STD
+
+    def __post_init__(self):
+        if self.locations is not None:  # what is kept from call to call is kept by a hash, which a list has not
+            object.__setattr__(self, "locations", tuple(self.locations))
+
+    @property
+    def per_load(self) -> int:
+        """Entries per load: 4, or 3 where the location is known."""
+        return 4 if self.locations is None else 3
+
+    @property
+    def size(self) -> int:
+        """The number of entries of gamma."""
+        return self.count * self.per_load
+
+    @property
+    def informative_priors(self) -> int:
+        """One per load where the width has a prior."""
+        return 0 if self.prior_name == "none" else self.count
+
+    def _split(self, gamma: Gamma) -> tuple[Tensor, Tensor, Tensor]:
+        """Force (..., K, 2) N, mu (..., K) m, c (..., K) 1/m^2."""
+        each = gamma.unflatten(-1, (self.count, self.per_load))
+        force, c = each[..., :2] * self.force_scale, torch.exp(each[..., -1]) / self.length**2
+        if self.locations is None:
+            return force, self.length * torch.sigmoid(each[..., 2]), c
+        return force, torch.tensor(self.locations, dtype=gamma.dtype).expand(*each.shape[:-1]), c
+
+    def loads(self, gamma: Gamma) -> tuple[Load, ...]:
+        """One GaussianLoads."""
+        force, mu, c = self._split(gamma)
+        spread = (math.pi / c).sqrt() * on_rod_fraction(mu, c, self.length)
+        return (GaussianLoads(force / spread.unsqueeze(-1), mu, c),)
+
+    def start(self) -> Float[Tensor, " n"]:
+        """No force, evenly spread along the rod, the prior's width."""
+        rows = []
+        for k in range(self.count):
+            eta = [] if self.locations is not None else [logit((k + 1) / (self.count + 1))]
+            rows.append([0.0, 0.0, *eta, self._log_c()])
+        return torch.tensor(rows, dtype=DTYPE).flatten()
+
+    def prior(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Zero +- force_std in each force, weak in eta; log c has the named prior, +-1."""
+        width_std = WEAK_STD if self.prior_name == "none" else LOG_C_STD
+        eta = [] if self.locations is not None else [0.0]
+        mean = torch.tensor([0.0, 0.0, *eta, self._log_c()], dtype=DTYPE).repeat(self.count)
+        std = torch.full((self.per_load,), WEAK_STD, dtype=DTYPE)
+        std[:2] = self.force_std
+        std[-1] = width_std
+        return mean, std.repeat(self.count) ** -2
+
+    def rescaled(self, gamma: Gamma, factor: float) -> Gamma:
+        """Forces times the factor, no load closer to an end than 5 % of the rod, the prior's width."""
+        each = gamma.unflatten(-1, (self.count, self.per_load))
+        eta = each[..., 2:-1].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
+        return torch.cat([factor * each[..., :2], eta, torch.full_like(each[..., -1:], self._log_c())], -1).flatten(-2)
+
+    def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
+        """gamma + step where a force or a place is hardly known; else along [log |F|, direction, log location, log c].
+
+        A push nearer the base looks like a weaker one farther out: the posterior is a banana in newtons and metres and more nearly
+        an ellipse in these logarithms.
+        """
+        each, by, std = (v.unflatten(-1, (self.count, self.per_load)) for v in torch.broadcast_tensors(gamma, step, std))
+        F, dF = each[..., :2], by[..., :2]
+        size = F.norm(dim=-1, keepdim=True).clamp(min=1e-300)
+        along, across = F / size, torch.stack([-F[..., 1], F[..., 0]], -1) / size
+        growth, turn = ((dF * e).sum(-1, keepdim=True) / size for e in (along, across))
+        curved = size * growth.clamp(max=SPREAD_LIMIT).exp() * (turn.cos() * along + turn.sin() * across)
+        sure = std[..., :2].norm(dim=-1, keepdim=True) < KNOWN * size
+        parts = [torch.where(sure, curved, F + dF), each[..., 2:] + by[..., 2:]]
+        if self.locations is None:
+            place = torch.sigmoid(each[..., 2:3])
+            farther = (place * torch.exp((1 - place) * by[..., 2:3])).clamp(1e-6, 1 - 1e-6)
+            sure = (1 - place) * std[..., 2:3] < KNOWN
+            parts[1:] = [torch.where(sure, torch.logit(farther), parts[1][..., :1]), parts[1][..., 1:]]
+        return torch.cat(parts, -1).flatten(-2)
+
+    def report_slope(self, gamma: Gamma) -> Float[Tensor, "... K 4"]:
+        """How each of [F_x, F_y, location, width], as described, moves with the one entry of gamma that moves it; 0: none does."""
+        _, mu, c = self._split(gamma)
+        force = torch.full_like(mu, self.force_scale)
+        location = mu * (1 - mu / self.length) if self.locations is None else torch.zeros_like(mu)
+        return torch.stack([force, force, location, -0.5 * (2 * c) ** -0.5], -1)
+
+    def _log_c(self) -> float:
+        name = "contact" if self.prior_name == "none" else self.prior_name
+        return -math.log(2 * WIDTH_OF_PRIOR[name] ** 2)
+
+    def describe(self, gamma: Gamma) -> LoadReport:
+        """Net force on the rod, mu and sigma = 1 / sqrt(2 c)."""
+        force, mu, c = self._split(gamma)
+        net = force / on_rod_fraction(mu, c, self.length).unsqueeze(-1)
+        return LoadReport(force, mu, (2 * c) ** -0.5, net)
