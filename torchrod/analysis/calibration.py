@@ -1,8 +1,8 @@
 """Calibration: mass per length, stiffness and load-cell offsets from unloaded shapes, by the estimator's own filter.
 
 The paper (section III.C) weighs its robot this way. The state is theta of analysis.unloaded_shapes, shared by all samples, with the
-markers of all of them stacked into one measurement; the recursion is that of estimation.filter, with the estimator's step limit,
-adaptive noise and test of convergence.
+markers of all of them stacked into one measurement; the recursion is estimation.filter's `advance`, with the estimator's step
+limit, adaptive noise and test of convergence.
 """
 
 import math
@@ -14,15 +14,15 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from ..estimation import filter as ekf
-from ..estimation.result import Z95
+from ..estimation.result import ACCEPT, Z95
 from ..estimation.solve import Settings
-from ..estimation.verdict import ACCEPT
 from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.robot import Robot
 from ..mechanics.tendons import Tendons
 from ..model.load_families import GaussianCoordinates
-from ..model.measurement import Markers, Model
-from ..model.validate import check
+from ..model.problem import Problem
+from ..model.sensors import Markers
+from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
 from ..util.status import Status
 from .unloaded_shapes import MASS, OFFSET, PRIOR, STIFFNESS, Trial, UnloadedShapes
@@ -110,7 +110,7 @@ class Calibration:
 def calibrate(
     robot: Robot,
     markers: Markers,
-    noise: float,
+    tension: Float[Tensor, "B T"] | None = None,
     youngs_modulus: bool = False,
     tension_offset: bool = False,
     settings: Settings | None = None,
@@ -118,13 +118,14 @@ def calibrate(
 ) -> Calibration:
     """Mass per length, and where asked stiffness and tension offsets, from the shapes of a robot that nothing touches but gravity.
 
-    markers: all samples are of one robot; gravity (3,) or (B, 3), base frame. noise: standard deviation of a marker coordinate (m).
+    markers: all samples are of one robot, with one noise for all; gravity (3,) or (B, 3), base frame. tension: (B, T) N, readings.
     Missing markers weigh nothing; a sample without a marker or an equilibrium is left out (`used`). Non-convergence is a status.
     Errors: ValueError, one sentence with the remedy, where the data cannot determine what is asked.
     Source: the paper, section III.C and (3), (4); docs/model.md.
     """
-    check(Model(robot, GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale)), markers, noise)
-    shapes = UnloadedShapes(robot, markers, markers.present / noise**2, youngs_modulus, tension_offset, steps)
+    none = Unknowns(GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale))
+    Problem(robot, none, [markers], tension, steps).check()
+    shapes = UnloadedShapes(robot, markers, tension, markers.weights[:, ::3], youngs_modulus, tension_offset, steps)
     _refuse(shapes)
     return _result(shapes, *_iterate(shapes, settings or Settings()))
 
@@ -136,7 +137,7 @@ def _refuse(shapes: UnloadedShapes) -> None:
         raise ValueError("the robot has no gravity, so its weight does not show; add gravity = [x, y, z] (m/s^2) to [rod]")
     if shapes.offsets and not len(robot.tendons):
         raise ValueError("the robot has no tendons, so there are no tension offsets; drop --tension-offset")
-    pulled = markers.tension is not None and bool((markers.tension > 0).any())
+    pulled = shapes.tension is not None and bool((shapes.tension > 0).any())
     if shapes.stiffness and not pulled:
         raise ValueError(
             "without tension only the ratio of weight to stiffness shows; add shapes with tension or drop --youngs-modulus"
@@ -147,50 +148,42 @@ def _refuse(shapes: UnloadedShapes) -> None:
 
 
 def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, " n"], Trial, int, Status]:
-    """The filter on theta: the recursion of estimation.solve for one state."""
-    mean = theta = before = shapes.start()
-    Q, Sigma0 = settings.Q * torch.ones_like(theta), torch.diag(settings.Sigma0 * torch.ones_like(theta))[None]
-    limits = ekf.Limits()
-    Sigma, kept, retreats, cap = Sigma0, torch.zeros(len(shapes.weights), dtype=torch.bool), 0, torch.full((1,), torch.inf)
+    """The filter on theta: estimation.filter's `advance` on a batch of one."""
+    mean, limits = shapes.start(), ekf.Limits(step=settings.step_limit)
+    prior, Q = (mean, torch.full_like(mean, PRIOR)), settings.Q * torch.ones_like(mean)
+    Sigma0, cap = settings.initial_covariance(mean)[None], torch.full((1,), torch.inf if settings.adaptive else 0.0, dtype=DTYPE)
+    at = ekf.Iterate(mean[None], Sigma0, mean[None], cap, torch.zeros(1, dtype=torch.bool))
+    kept, retreats = torch.zeros(len(shapes.weights), dtype=torch.bool), 0
     for iteration in range(1, settings.max_iterations + 1):
-        trial = shapes.linearize(theta, mean)
-        at, w, solved = trial.at, trial.w, trial.solved
-        if bool((kept & ~solved).any()) and retreats < RETREATS:
+        trial = shapes.linearize(at.x[0], mean)
+        if bool((kept & ~trial.solved).any()) and retreats < RETREATS:
             # A step too far: half way back to the last place where these samples had an equilibrium.
-            theta, retreats = 0.5 * (theta + before), retreats + 1
+            at, retreats = replace(at, x=0.5 * (at.x + at.before)), retreats + 1
             continue
-        if not bool((w > 0).any()):
+        if not bool((trial.w > 0).any()):
             if iteration > 1:
-                return theta, trial, iteration, Status.NOT_CONVERGED
+                return at.x[0], trial, iteration, Status.NOT_CONVERGED
             raise ValueError(
-                f"no sample has markers, finite tensions and an equilibrium at {float(theta[0].exp()):.3g} kg/m; check the units "
+                f"no sample has markers, finite tensions and an equilibrium at {float(mean[0].exp()):.3g} kg/m; check the units "
                 "of tensions and stiffness, or start from another mass_per_length"
             )
-        if bool(at.decrement < (limits.share * at.cost).clamp(min=limits.decrement)):
-            return theta, trial, iteration, Status.CONVERGED
-        inflated = torch.minimum(ekf.inflation(w, w.shape[-1], at.decrement), cap)
-        weights = ekf.adapted_weights(w, w.shape[-1], inflated) if settings.adaptive else w
-        A, g = ekf.information(at.H, at.r, weights, theta[None], mean, torch.full_like(theta, PRIOR))
-        step, Sigma_next = ekf.update(ekf.predict(Sigma, Q), A, g)
-        # Where the adapted shapes has settled but the true one has not, the weights must move on towards the true ones.
-        cap = torch.where((g * step).sum(-1) < limits.settled, 0.1 * inflated, cap)
-        Sigma = Sigma_next if bool(torch.isfinite(Sigma_next).all()) else Sigma0
-        before, kept, retreats = theta, solved, 0
-        theta = shapes.stopped_at_kinks(theta, ekf.limited(step, settings.step_limit)[0])
-    return theta, shapes.linearize(theta, mean), settings.max_iterations, Status.NOT_CONVERGED
+        onward = ekf.advance(at, trial.normal, Sigma0, prior, Q, limits)
+        if bool(onward.done):
+            return at.x[0], trial, iteration, Status.CONVERGED
+        kept, retreats = trial.solved, 0
+        at = replace(onward, x=shapes.stopped_at_kinks(at.x[0], (onward.x - at.x)[0])[None])
+    return at.x[0], shapes.linearize(at.x[0], mean), settings.max_iterations, Status.NOT_CONVERGED
 
 
 def _result(shapes: UnloadedShapes, theta: Float[Tensor, " n"], trial: Trial, iterations: int, status: Status) -> Calibration:
     """Values and standard deviations in SI units, residuals and chi2 at theta."""
-    r, w = trial.at.r, trial.w
+    r, w = trial.r, trial.w
     chi2, dof = float((w * r * r).sum()), int((w > 0).sum()) - len(theta)
     excess = max(1.0, chi2 / max(dof, 1))
     prior = torch.diag(torch.full_like(theta, PRIOR))
     values, log, names = shapes.physical(theta), shapes.logarithmic, shapes.names
     unknown = math.nan if status is not Status.CONVERGED else 1.0
-    stated, std = (
-        unknown * ekf.posterior((trial.A_mean - prior) / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess)
-    )
+    stated, std = (unknown * ekf.posterior(trial.A_mean / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess))
     size = torch.where(log, values, shapes.unit)
     reach = Z95 * torch.stack([-std, std], -1)
     around = values.unsqueeze(-1)

@@ -20,12 +20,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..estimation.result import Estimate
-from ..estimation.solve import Settings, estimate
+from ..estimation.solve import Settings, estimate_each
 from ..model.load_families import GaussianCoordinates
 from ..model.marker_geometry import misplaced
-from ..model.measurement import Markers, Model
-from ..model.validate import usable
+from ..model.problem import Problem
+from ..model.sensors import Markers
+from ..model.unknowns import Registration, Unknowns
 from ..util.status import Status
+from .count import free_parameters
 
 Cycle = tuple[int, ...]
 MOST_EXCHANGES = 3
@@ -148,126 +150,132 @@ def _cycles(order: list[int]) -> tuple[Cycle, ...]:
     return tuple(found)
 
 
-def _exchanged(
-    model: Model, markers: Markers, noise: float, residual: Float[Tensor, "b P 3"], chi2: Float[Tensor, " b"], settings: Settings
-) -> list[tuple[Cycle, ...]]:
-    """Per sample the groups of labels whose exchange makes the fit explain the markers far better."""
+def _exchanged(problem: Problem, fit: Estimate, index: Int[Tensor, " b"], settings: Settings) -> list[tuple[Cycle, ...]]:
+    """Per sample of `index`, which is all of the problem, the groups of labels whose exchange makes the fit explain far better."""
+    found: list[tuple[Cycle, ...]] = [()] * len(index)
+    markers = problem.markers
+    if markers is None or not len(index):
+        return found
     z = markers.positions
-    fitted = z - residual
-    best: Float[Tensor, " b"] = chi2.clone()
-    found: list[tuple[Cycle, ...]] = [()] * len(z)
+    fitted = z - fit.residual[index]
+    best: Float[Tensor, " b"] = fit.chi2[index].clone()
     for cost in (lambda z: _misfit(fitted, z), lambda z: _stretch(markers, z)):
         order = _exchanges(z, cost)
-        index = (order != torch.arange(z.shape[1])).any(-1).nonzero().squeeze(-1)
-        index = index[[_cycles(order[b].tolist()) != found[b] for b in index.tolist()]]
-        if not len(index):
+        some = (order != torch.arange(z.shape[1])).any(-1).nonzero().squeeze(-1)
+        some = some[[_cycles(order[b].tolist()) != found[b] for b in some.tolist()]]
+        if not len(some):
             continue
-        part = markers.take(index)
-        part = replace(part, positions=part.positions.gather(1, order[index].unsqueeze(-1).expand(-1, -1, 3)))
-        other = estimate(model, part, noise, settings)
-        better = (other.status == int(Status.CONVERGED)) & (other.chi2 < LOWERED * best[index])
-        for b, row in zip(index[better].tolist(), order[index[better]].tolist(), strict=True):
+        part = problem.take(some)
+        own = part.markers
+        assert own is not None
+        swapped = replace(own, positions=own.positions.gather(1, order[some].unsqueeze(-1).expand(-1, -1, 3)))
+        other = estimate_each(replace(part, sensors=[swapped]), settings)
+        better = (other.status == int(Status.CONVERGED)) & (other.chi2 < LOWERED * best[some])
+        for b, row in zip(some[better].tolist(), order[some[better]].tolist(), strict=True):
             found[b] = _cycles(row)
-        best[index[better]] = other.chi2[better]
+        best[some[better]] = other.chi2[better]
     return found
 
 
-def _bic(accepted: Bool[Tensor, " b"], chi2: Float[Tensor, " b"], model: Model, n: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
-    """chi^2 + k ln(n) as in analysis.count, and a registration's numbers count as well; inf where not accepted."""
-    k = model.load_size - model.coordinates.informative_priors + 6 * model.registration
-    return torch.where(accepted, chi2 + k * torch.log(n), torch.inf)
+def _score(problem: Problem, accepted: Bool[Tensor, " b"], chi2: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+    """chi^2 + k ln(n), where a registration's numbers count as well as those of analysis.count; inf where not accepted."""
+    k = free_parameters(problem) + problem.state.registration.size
+    return torch.where(accepted, chi2 + k * torch.log(problem.seen.clamp(min=3).to(chi2.dtype)), torch.inf)
 
 
-def _with_loads(model: Model, count: int) -> Model | None:
-    """The model with so many loads, where its loads are Gaussians at unknown places."""
-    coordinates = model.coordinates
-    if not isinstance(coordinates, GaussianCoordinates) or coordinates.locations is not None or count < 1:
+def _with_loads(unknowns: Unknowns, count: int) -> Unknowns | None:
+    """The unknowns with so many loads, where they are Gaussians at unknown places."""
+    loads = unknowns.loads
+    if not isinstance(loads, GaussianCoordinates) or loads.locations is not None or count < 1:
         return None
-    return replace(model, coordinates=replace(coordinates, count=count))
+    return replace(unknowns, loads=replace(loads, count=count))
 
 
-def _explained(
-    model: Model, markers: Markers, noise: float, own: Float[Tensor, " b"], settings: Settings
-) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"]]:
-    """An error of the base frame, or that one more load, explains the markers: of the two and the fit (its BIC: own) the best.
+def _explained(problem: Problem, own: Float[Tensor, " b"], settings: Settings) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"]]:
+    """An error of the base frame, or that one more load, explains the markers: of the two and the fit (its score: own) the best.
 
     A fit that is accepted, for which own is finite, may still have loads that a base frame with fewer would do without.
     """
-    n, everyone, refused = (
-        3.0 * markers.present.sum(-1).clamp(min=1),
-        torch.arange(len(own)),
-        torch.isinf(own).nonzero().squeeze(-1),
-    )
+    unknowns, everyone, refused = problem.unknowns, torch.arange(len(own)), torch.isinf(own).nonzero().squeeze(-1)
     zeta = torch.full((len(own), 6), torch.nan, dtype=torch.float64)
     by_frame, by_load = torch.full_like(own, torch.inf), torch.full_like(own, torch.inf)
-    count = getattr(model.coordinates, "count", 0)
-    tried = [(model, refused)] + [(_with_loads(model, k), everyone) for k in {1, count - 1} - {count}]
-    for loads, index in tried if not model.registration else ():
-        moved = None if loads is None else replace(loads, registration=True)
-        if moved is None or not len(index) or 3 * len(markers.s) < moved.free_size:
+    count = getattr(unknowns.loads, "count", 0)
+    tried = [(unknowns, refused)] + [(_with_loads(unknowns, k), everyone) for k in {1, count - 1} - {count}]
+    for some, index in tried if unknowns.registration is None else ():
+        if some is None or not len(index):
             continue
-        fit = estimate(moved, markers.take(index), noise, settings)
+        part = problem.of(replace(some, registration=Registration())).take(index)
+        if not part.determined:
+            continue
+        fit = estimate_each(part, settings)
         assert fit.registration is not None
         shift, turn = fit.registration.split(3, -1)
-        small = (shift.norm(dim=-1) < TRANSLATION * model.robot.rod.length) & (turn.norm(dim=-1) < ROTATION)
-        score = torch.where(small, _bic(fit.accepted, fit.chi2, moved, n[index]), torch.inf)
+        small = (shift.norm(dim=-1) < TRANSLATION * problem.robot.rod.length) & (turn.norm(dim=-1) < ROTATION)
+        score = torch.where(small, _score(part, fit.accepted, fit.chi2), torch.inf)
         zeta[index] = torch.where((score < by_frame[index]).unsqueeze(-1), fit.registration, zeta[index])
         by_frame[index] = torch.minimum(by_frame[index], score)
-    more = _with_loads(model, count + 1)
-    if more is not None and len(refused) and 3 * len(markers.s) >= more.free_size:
-        fit = estimate(more, markers.take(refused), noise, settings)
-        by_load[refused] = _bic(fit.accepted, fit.chi2, more, n[refused])
+    more = _with_loads(unknowns, count + 1)
+    if more is not None and len(refused) and (part := problem.of(more).take(refused)).determined:
+        fit = estimate_each(part, settings)
+        by_load[refused] = _score(part, fit.accepted, fit.chi2)
     best = torch.minimum(by_frame, torch.minimum(by_load, own - SURE))
     framed = torch.isfinite(best) & (by_frame == best)
     return torch.where(framed.unsqueeze(-1), zeta, torch.nan), torch.isfinite(best) & ~framed & (by_load == best)
 
 
-def _outliers(model: Model, markers: Markers, noise: float, settings: Settings) -> list[Cycle]:
+def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
     """Per sample the few markers far off without which a robust fit explains the others."""
-    if math.isfinite(settings.robust) or not len(markers.positions):
-        return [()] * len(markers.positions)
-    fit = estimate(model, markers, noise, replace(settings, robust=ROBUST))
+    markers = problem.markers
+    if math.isfinite(settings.robust) or markers is None or not problem.batch:
+        return [()] * problem.batch
+    fit = estimate_each(problem, replace(settings, robust=ROBUST))
     few = fit.outlier.sum(-1) <= FEW * markers.present.sum(-1)
+    noise = markers.noise.unsqueeze(-1) if isinstance(markers.noise, Tensor) else markers.noise
     told = fit.outlier & (fit.residual.norm(dim=-1) > CLEAR * noise) & (fit.accepted & few).unsqueeze(-1)
     return [tuple(row.nonzero().flatten().tolist()) for row in told]
 
 
 def diagnose(
-    parts: Sequence[tuple[Model, Int[Tensor, " b"]]],
-    markers: Markers,
-    noise: float,
+    problem: Problem,
     fit: Estimate,
     settings: Settings | None = None,
+    parts: Sequence[tuple[Unknowns, Int[Tensor, " b"]]] | None = None,
 ) -> Diagnosis:
-    """Look for the mistake behind every fit that does not explain its markers.
+    """Look for the mistake behind every fit that does not explain its readings.
 
-    parts: of the batch, each with the model it was fitted by. Where there are several, the number of loads was chosen from the
-    data, and an error of the base frame may have passed for loads: accepted fits of two loads and more are looked at as well. Costs
-    a few more fits of these samples, and nothing for the others.
+    parts: of the batch, each with the unknowns it was fitted by; None: all by the problem's own. Where there are several, the
+    number of loads was chosen from the data, and an error of the base frame may have passed for loads: accepted fits of two loads
+    and more are looked at as well. Costs a few more fits of these samples, and nothing for the others.
     """
-    hasty = replace(settings or Settings(), restarts=(), max_iterations=ITERATIONS)
-    exchanged: list[tuple[Cycle, ...]] = [()] * len(fit.status)
-    registration = torch.full((len(fit.status), 6), torch.nan, dtype=torch.float64)
-    one_more, geometry = torch.zeros(len(fit.status), dtype=torch.bool), [""] * len(fit.status)
-    outliers: list[Cycle] = [()] * len(fit.status)
+    parts = [(problem.unknowns, torch.arange(problem.batch))] if parts is None else parts
+    hasty, B = replace(settings or Settings(), restarts=(), max_iterations=ITERATIONS), len(fit.status)
+    exchanged: list[tuple[Cycle, ...]] = [()] * B
+    registration, one_more = torch.full((B, 6), torch.nan, dtype=torch.float64), torch.zeros(B, dtype=torch.bool)
+    geometry = [""] * B
+    outliers: list[Cycle] = [()] * B
+    markers, L = problem.markers, problem.robot.rod.length
+
+    def misplaced_at(b: int) -> str:
+        return "" if markers is None else misplaced(markers, b, L)
+
     for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():
-        geometry[b] = misplaced(markers, b, parts[0][0].robot.rod.length)
-    richest = [model for model, _ in parts if 3 * len(markers.s) >= model.free_size][-1]
-    for model, index in parts:
-        chosen = len(parts) > 1 and model.load_size > 4
-        doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & usable(model, markers.take(index))
+        geometry[b] = misplaced_at(b)
+    richest = [own for own in (problem.of(unknowns) for unknowns, _ in parts) if own.determined][-1]
+    for unknowns, index in parts:
+        own = problem.of(unknowns)
+        chosen = len(parts) > 1 and own.state.external.stop > 4
+        doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & own.take(index).usable
         for rows in index[doubtful].split(CHUNK):
             refused = rows[~fit.accepted[rows]]
-            found = _exchanged(model, markers.take(refused), noise, fit.residual[refused], fit.chi2[refused], hasty)
+            found = _exchanged(own.take(refused), fit, refused, hasty)
             for b, cycles in zip(refused.tolist(), found, strict=True):
                 exchanged[b] = cycles
             for b in [b for b in refused.tolist() if not exchanged[b]]:
-                geometry[b] = misplaced(markers, b, model.robot.rod.length)
+                geometry[b] = misplaced_at(b)
             rest = rows[[not (exchanged[b] or geometry[b]) for b in rows.tolist()]]
-            part, n = markers.take(rest), 3.0 * markers.present[rest].sum(-1)
-            own = _bic(fit.accepted[rest], fit.chi2[rest], model, n)
-            registration[rest], one_more[rest] = _explained(model, part, noise, own, hasty)
+            part = own.take(rest)
+            registration[rest], one_more[rest] = _explained(part, _score(part, fit.accepted[rest], fit.chi2[rest]), hasty)
             rest = rest[~fit.accepted[rest] & ~one_more[rest] & registration[rest].isnan().any(-1)]
-            for b, off in zip(rest.tolist(), _outliers(richest, markers.take(rest), noise, settings or Settings()), strict=True):
+            for b, off in zip(rest.tolist(), _outliers(richest.take(rest), settings or Settings()), strict=True):
                 outliers[b] = off
-    return Diagnosis(markers.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers))
+    return Diagnosis(problem.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers))

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.robot import Robot
+from ..model.unknowns import Registration
 from ..util.precision import DTYPE
-from .observability import around, check, covariance, held, places, push_model, pushed, seen_by, sensitivity
+from .observability import around, check, covariance, held, places, push_problem, pushed, seen_by, sensitivity
 
 CANDIDATES = 50  # evenly spaced along the rod, beside those of the even layout; the last is the tip
 PLACES = 24  # of the push
@@ -73,20 +74,19 @@ def _information(
     force: float,
     nearest: float,
     tension: Float[Tensor, " T"] | None,
-    registration: bool,
+    registration: Registration | None,
     directions: int,
     steps: int,
 ) -> tuple[Float[Tensor, "C B m m"], Float[Tensor, "m m"]]:
     """A_i of (1) for every candidate and push, and `held`. Pushes without an equilibrium are left out."""
-    model = push_model(robot, registration, steps)
     at = places(robot, PLACES, nearest).repeat_interleave(directions)
     F = force * around(directions)[1].repeat(PLACES, 1)
-    markers = seen_by(candidates, at, tension)
-    J = sensitivity(model, pushed(model, F, at, markers.tension), markers, KNOWN)[:, : len(candidates)] / noise
+    problem = push_problem(robot, seen_by(candidates, at, noise), tension, registration, steps)
+    J = sensitivity(problem, pushed(problem, F, at), KNOWN)[:, : len(candidates)] / noise
     solved = torch.isfinite(J).flatten(1).all(-1)
     if not bool(solved.any()):
         raise ValueError(f"force {force} N: no equilibrium was found under it anywhere along the rod; check its size and units")
-    return (J.mT @ J)[solved].movedim(0, 1), held(model, KNOWN)
+    return (J.mT @ J)[solved].movedim(0, 1), held(problem, KNOWN)
 
 
 def _apart(candidates: Float[Tensor, " C"], others: Int[Tensor, " P1"], gap: float) -> Bool[Tensor, " C"]:
@@ -120,7 +120,7 @@ def place(
     noise: float,
     force: float,
     tension: Float[Tensor, " T"] | None = None,
-    registration: bool = False,
+    registration: Registration | None = None,
     nearest: float | None = None,
     gap: float | None = None,
     directions: int = 8,

@@ -23,9 +23,10 @@ from scipy.special import stdtrit
 from torch import Tensor
 
 from ..estimation.result import Z95, Estimate
-from ..estimation.solve import Settings, estimate
-from ..estimation.starts import Start, StartRule, cold_start
-from ..model.measurement import Markers, Model
+from ..estimation.solve import Settings, estimate_each
+from ..estimation.starts import Origin, Start, StartRule, cold_start
+from ..model.problem import Problem
+from ..model.unknowns import Unknowns
 
 FIRST = 1 / 400  # of the rod's length: 1 mm on the paper's
 ROUNDS = 6
@@ -67,34 +68,44 @@ def white(fit: Estimate) -> Bool[Tensor, " B"]:
     return rho < SMOOTH / (3 * pairs.clamp(min=1)).sqrt()
 
 
-def _spent(model: Model) -> int:
+def _spent(problem: Problem) -> int:
     """What the unknowns take of the marker coordinates: nu of (1) is 3 for every marker that the fit uses, less this."""
-    return model.free_size - model.coordinates.informative_priors
+    return problem.state.free_size - problem.state.loads.informative
 
 
-def _sigma(model: Model, fit: Estimate) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
+def _sigma(problem: Problem, fit: Estimate) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """(1), over the markers that are not outliers."""
     used = torch.isfinite(fit.residual[..., 0]) & ~fit.outlier
-    nu = 3.0 * used.sum(-1) - _spent(model)
+    nu = 3.0 * used.sum(-1) - _spent(problem)
     square = torch.where(used, fit.residual.square().sum(-1), 0.0).sum(-1)
-    return torch.where(nu > 0, (square / nu).sqrt().clamp(min=LEAST * model.robot.rod.length), torch.nan), nu
+    return torch.where(nu > 0, (square / nu).sqrt().clamp(min=LEAST * problem.robot.rod.length), torch.nan), nu
+
+
+def with_noise(problem: Problem, sigma: float | Float[Tensor, " B"]) -> Problem:
+    """The problem with another noise (m) of its markers, one for all samples or one for each."""
+    markers = problem.markers
+    assert markers is not None
+    return replace(problem, sensors=[replace(markers, noise=sigma)])
 
 
 def estimate_noise(
-    model: Model, markers: Markers, settings: Settings | None = None, start: StartRule = cold_start
-) -> tuple[Noise, Markers]:
-    """The noise of every sample by fits of `model`, which must be rich enough to explain the markers; and the markers with it.
+    problem: Problem, settings: Settings | None = None, start: StartRule = cold_start
+) -> tuple[Noise, Float[Tensor, " B"]]:
+    """The noise of every sample's markers by fits of a problem that must be rich enough to explain them; and the noise to fit with.
 
-    Give a fit to those markers to Noise.judged. Errors: ValueError as torchrod.estimate.
+    The markers must be its only sensor; their stated noise plays no part. The second value is finite for every sample, also where
+    nothing tells the noise: give a fit of `with_noise(problem, sigma)` to Noise.judged. Errors: ValueError as torchrod.estimate,
+    and for other sensors.
     """
-    L, settings = model.robot.rod.length, replace(settings or Settings(), restarts=())
-    sigma = torch.full((len(markers.positions),), FIRST * L, dtype=torch.float64)
+    if problem.markers is None:
+        raise ValueError("the noise can be estimated of markers alone; state the noise where other sensors were read as well")
+    L, settings = problem.robot.rod.length, replace(settings or Settings(), restarts=())
+    sigma = torch.full((problem.batch,), FIRST * L, dtype=torch.float64)
     begin: StartRule | Start = start
     nu, settled = torch.zeros_like(sigma), torch.zeros_like(sigma, dtype=torch.bool)
     for _ in range(ROUNDS):
-        known = replace(markers, sigma=sigma)
-        fit = estimate(model, known, FIRST * L, settings, begin)
-        found, freedom = _sigma(model, fit)
+        fit = estimate_each(with_noise(problem, sigma), settings, begin)
+        found, freedom = _sigma(problem, fit)
         moved = (found / sigma).log().abs().nan_to_num(0.0)
         # Not down to nothing in one round: the fit must follow. A sample that has settled stays, whatever its neighbours do.
         onward = torch.maximum(found.where(torch.isfinite(found), sigma), 0.02 * sigma)
@@ -102,36 +113,34 @@ def estimate_noise(
         settled = settled | (moved < SETTLED)
         if bool(settled.all()):
             break
-        begin = Start(fit.x, None, torch.isfinite(fit.x).all(-1))
+        begin = Start(fit.x, torch.full_like(fit.origin, int(Origin.OTHER_FIT)), torch.isfinite(fit.x).all(-1))
     known = nu > 0
     std = torch.where(sigma > LEAST * L, sigma / (2 * nu.clamp(min=1)).sqrt(), 0.0)
-    noise = Noise(sigma.where(known, torch.nan), std.where(known, torch.nan), nu)
-    return noise, replace(markers, sigma=sigma)
+    return Noise(sigma.where(known, torch.nan), std.where(known, torch.nan), nu), sigma
 
 
 def estimate_noise_among(
-    models: Sequence[Model], markers: Markers, settings: Settings | None = None, start: StartRule = cold_start
-) -> tuple[Noise, Markers]:
-    """The same where nobody knows the number of loads either: models of the same kind, each with more loads than the one before.
+    problem: Problem, candidates: Sequence[Unknowns], settings: Settings | None = None, start: StartRule = cold_start
+) -> tuple[Noise, Float[Tensor, " B"]]:
+    """The same where nobody knows the number of loads either: unknowns of the same kind, each with more loads than the one before.
 
     The richest that a sample has markers for tells its noise. It contains the others, so that its residual is the least of all;
     where a poorer one leaves less, the fit of the richest has not settled, and the poorer one tells it. Without that a tenth of the
-    samples without a load, and 3 % of those with one, get a noise up to 14 times too large when it is 0.2 mm. A model without a
-    load never stands in for one that has too few markers: it would take a load for noise. Nor does one that leaves more markers
+    samples without a load, and 3 % of those with one, get a noise up to 14 times too large when it is 0.2 mm. Unknowns without a
+    load never stand in for those that have too few markers: they would take a load for noise. Nor do any that leave more markers
     aside as outliers: a robust fit with too few loads calls most of them so.
     """
-    fitting = [model for model in models if 3 * len(markers.s) >= model.free_size] or [models[0]]
-    noise, known = estimate_noise(fitting[-1], markers, settings, start)
+    problems = [problem.of(unknowns) for unknowns in candidates]
+    fitting = [p for p in problems if p.determined] or problems[:1]
+    noise, sigma = estimate_noise(fitting[-1], settings, start)
     used = noise.freedom + _spent(fitting[-1])
-    for model in reversed(fitting[:-1]):
-        other, by_other = estimate_noise(model, markers, settings, start)
-        by_more = other.freedom + _spent(model)
+    for poorer in reversed(fitting[:-1]):
+        other, by_other = estimate_noise(poorer, settings, start)
+        by_more = other.freedom + _spent(poorer)
         less = (other.sigma.square() * other.freedom < noise.sigma.square() * noise.freedom) & (by_more >= used)
-        instead = torch.isnan(noise.sigma) & torch.isfinite(other.sigma) & (model.load_size > 0)
-        swap = less | instead
+        loaded = poorer.state.external.stop > 0
+        swap = less | (torch.isnan(noise.sigma) & torch.isfinite(other.sigma) & loaded)
         used = torch.where(swap, by_more, used)
         noise = Noise(*(torch.where(swap, theirs, mine) for mine, theirs in zip(astuple(noise), astuple(other), strict=True)))
-        assert known.sigma is not None
-        assert by_other.sigma is not None
-        known = replace(known, sigma=torch.where(swap, by_other.sigma, known.sigma))
-    return noise, known
+        sigma = torch.where(swap, by_other, sigma)
+    return noise, sigma

@@ -23,7 +23,9 @@ from ..mechanics.loads import PointForces
 from ..mechanics.robot import Robot
 from ..mechanics.statics import solve_shape
 from ..model.load_families import GaussianCoordinates
-from ..model.measurement import Markers, Model
+from ..model.problem import TIP_ROWS, Problem
+from ..model.sensors import Markers
+from ..model.unknowns import Registration, Unknowns
 from ..util.precision import DTYPE, as_float64
 
 PUSH_WIDTH = 1 / 400  # sigma / L of a push: 1 mm on the paper's rod
@@ -54,12 +56,17 @@ class Observability:
     localizable: Float[Tensor, "K D"]
 
 
-def push_model(
-    robot: Robot, registration: bool = False, steps: int = DEFAULT_STEPS, frame_std: tuple[float, float] | None = None
-) -> Model:
-    """The estimator's model of one contact, without a prior on it."""
+def push_problem(
+    robot: Robot,
+    markers: Markers,
+    tension: Float[Tensor, "*B T"] | None = None,
+    registration: Registration | None = None,
+    steps: int = DEFAULT_STEPS,
+) -> Problem:
+    """The estimator's problem of one contact, without a prior on it; tensions (N) of every sample or of all."""
     loads = GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale, "none")
-    return Model(robot, loads, registration, steps=steps, frame_std=frame_std)
+    tension = None if tension is None else tension.expand(len(markers.positions), -1)
+    return Problem(robot, Unknowns(loads, registration=registration), [markers], tension, steps)
 
 
 def places(robot: Robot, count: int, nearest: float | None = None) -> Float[Tensor, " K"]:
@@ -74,49 +81,47 @@ def around(count: int) -> tuple[Float[Tensor, " D"], Float[Tensor, "D 2"]]:
     return angle, torch.stack([angle.cos(), angle.sin()], -1)
 
 
-def state(model: Model, force: Float[Tensor, "B 2"], location: Float[Tensor, " B"], alpha: Float[Tensor, "B 6"]) -> Tensor:
+def state(problem: Problem, force: Float[Tensor, "B 2"], location: Float[Tensor, " B"], alpha: Float[Tensor, "B 6"]) -> Tensor:
     """x of a push PUSH_WIDTH wide: force (N, section frame), location (m), base wrench alpha (N, N m)."""
-    rod = model.robot.rod
+    rod = problem.robot.rod
     log_c = torch.full_like(location, -math.log(2 * PUSH_WIDTH**2))
     gamma = torch.cat([force / rod.force_scale, torch.stack([torch.logit(location / rod.length), log_c], -1)], -1)
-    return model.join(gamma, alpha)
+    return problem.state.join(gamma, alpha)
 
 
-def pushed(
-    model: Model, force: Float[Tensor, "B 2"], location: Float[Tensor, " B"], tension: Tensor | None
-) -> Float[Tensor, "B n"]:
-    """x in equilibrium under a push of force (N, section frame) at location (m) and tensions (B, T) N; NaN where there is none."""
+def pushed(problem: Problem, force: Float[Tensor, "B 2"], location: Float[Tensor, " B"]) -> Float[Tensor, "B n"]:
+    """x in equilibrium under a push of force (N, section frame) at location (m); NaN where there is none."""
     push = PointForces(torch.nn.functional.pad(force, (0, 1)).unsqueeze(1), location.unsqueeze(1))
-    tip = location.new_tensor([model.robot.rod.length])
-    return state(model, force, location, solve_shape(model.robot, (push,), tension, tip, len(force), model.steps).base_wrench)
+    tip = location.new_tensor([problem.robot.rod.length])
+    solved = solve_shape(problem.robot, (push,), problem.tension, tip, len(force), problem.steps)
+    return state(problem, force, location, solved.base_wrench)
 
 
-def sensitivity(model: Model, x: Float[Tensor, "B n"], markers: Markers, unknown: tuple[int, ...]) -> Float[Tensor, "B P 3 m"]:
+def sensitivity(problem: Problem, x: Float[Tensor, "B n"], unknown: tuple[int, ...]) -> Float[Tensor, "B P 3 m"]:
     """dp/d[load, zeta] of every marker in equilibrium: `unknown` says which of [F_x, F_y, s, width] are, zeta with registration.
 
-    In units of the force scale, of L for the location, and of Model for zeta.
+    In units of the force scale, of L for the location, and of Problem.state for zeta.
 
     (2) The tip residual (17) is zero in truth: dc = C_t dt + C_a d(alpha) = 0 with t = [load, zeta] and C_t, C_a blocks of H.
-    (3) Hence d(alpha) = -C_a^-1 C_t dt and dp = (H_t - H_a C_a^-1 C_t) dt: what (1) tends to as the weight of c grows. Model's
+    (3) Hence d(alpha) = -C_a^-1 C_t dt and dp = (H_t - H_a C_a^-1 C_t) dt: what (1) tends to as the weight of c grows. Problem's
         exact_weights come within 1 % of it, but leave a matrix that round-off can make singular.
     """
-    rows, g = [], model.coordinates.size
+    rows, g, base = [], problem.state.loads.size, problem.state.base.at
     for first in range(0, len(x), CHUNK):
         index = torch.arange(first, min(first + CHUNK, len(x)))
-        _, H = model.linearized(x[index], markers.take(index))
+        _, H = problem.take(index).linearized(x[index])
         # mu = L S(eta), so d(mu / L)/d(eta) = t (1 - t).
         t = torch.sigmoid(x[index, 2])
         H = torch.cat([H[..., :2], H[..., 2:3] / (t * (1 - t))[:, None, None], H[..., 3:]], -1)
-        H_t, H_a = H[..., [*unknown, *range(g, model.size - 6)]], H[..., -6:]
+        H_t, H_a = H[..., [*unknown, *range(g, base.start)]], H[..., base]
         turn = torch.linalg.solve_ex(H_a[:, -6:], H_t[:, -6:]).result
         rows.append((H_t - H_a @ turn)[:, :-6])
     return torch.cat(rows).unflatten(1, (-1, 3))
 
 
-def held(model: Model, unknown: tuple[int, ...]) -> Float[Tensor, "m m"]:
+def held(problem: Problem, unknown: tuple[int, ...]) -> Float[Tensor, "m m"]:
     """What (1) adds to the information: the estimator's weak prior on zeta, nothing on the load."""
-    _, precision = model.prior()
-    return torch.diag(torch.cat([torch.zeros(len(unknown), dtype=DTYPE), precision[model.coordinates.size : -6]]))
+    return torch.diag(torch.cat([torch.zeros(len(unknown), dtype=DTYPE), problem.state.registration.precision]))
 
 
 def covariance(A: Float[Tensor, "*B m m"]) -> tuple[Float[Tensor, "*B m m"], Bool[Tensor, "*B"]]:
@@ -129,12 +134,12 @@ def covariance(A: Float[Tensor, "*B m m"]) -> tuple[Float[Tensor, "*B m m"], Boo
 
 
 def _bounded(
-    model: Model, x: Float[Tensor, "B n"], markers: Markers, noise: float, unknown: tuple[int, ...]
+    problem: Problem, x: Float[Tensor, "B n"], unknown: tuple[int, ...]
 ) -> tuple[Float[Tensor, "B m m"], Bool[Tensor, " B"]]:
     """C of (1), and where it does not exist."""
-    J = sensitivity(model, x, markers, unknown) / noise
-    J = torch.where(markers.present[..., None, None], J, 0.0).flatten(1, 2)
-    return covariance(J.mT @ J + held(model, unknown))
+    J = sensitivity(problem, x, unknown).flatten(1, 2)
+    J = torch.where(problem.weights[:, :-TIP_ROWS, None] > 0, J * problem.weights[:, :-TIP_ROWS, None].sqrt(), 0.0)
+    return covariance(J.mT @ J + held(problem, unknown))
 
 
 def load_bound(
@@ -143,23 +148,22 @@ def load_bound(
     force: Float[Tensor, "B 2"],
     location: Float[Tensor, " B"],
     base_wrench: Float[Tensor, "B 6"],
-    noise: float,
-    registration: bool = False,
+    tension: Float[Tensor, "*B T"] | None = None,
+    registration: Registration | None = None,
     width_known: bool = True,
     steps: int = DEFAULT_STEPS,
-    frame_std: tuple[float, float] | None = None,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, by (1).
 
-    force: N, section frame, not zero; location: m, inside the rod; base_wrench: N, N m, in equilibrium with the push; noise:
-    standard deviation of a marker coordinate (m). Markers count where their positions are finite; the numbers play no part.
-    frame_std: with registration, what is known of the base frame (m, rad), as Model.frame_std.
+    force: N, section frame, not zero; location: m, inside the rod; base_wrench: N, N m, in equilibrium with the push; tension: N.
+    Markers count with their noise where their positions are finite; the numbers play no part. registration: what is known of a base
+    frame that is unknown.
     A bound is inf where the markers do not show the push, NaN where the base wrench is.
     """
     force, location, base_wrench = as_float64(force), as_float64(location), as_float64(base_wrench)
-    model = push_model(robot, registration, steps, frame_std)
+    problem = push_problem(robot, markers, tension, registration, steps)
     unknown = (0, 1, 2) if width_known else (0, 1, 2, 3)
-    C, singular = _bounded(model, state(model, force, location, base_wrench), markers, noise, unknown)
+    C, singular = _bounded(problem, state(problem, force, location, base_wrench), unknown)
     along = force / force.norm(dim=-1, keepdim=True)
     magnitude = (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten().sqrt() * robot.rod.force_scale
     place = C[:, 2, 2].sqrt() * robot.rod.length
@@ -173,8 +177,8 @@ def noncentrality() -> float:
     return float(brentq(lambda size: 1 - chndtr(threshold, 2, size) - POWER, 1.0, 100.0))  # pyright: ignore[reportArgumentType]
 
 
-def seen_by(s: Float[Tensor, " P"], location: Float[Tensor, " B"], tension: Float[Tensor, " T"] | None) -> Markers:
-    """Markers at s (m), and a missing one at every place of a push.
+def seen_by(s: Float[Tensor, " P"], location: Float[Tensor, " B"], noise: float) -> Markers:
+    """Markers at s (m) with this noise (m), and a missing one at every place of a push.
 
     That puts a node of the grid at the push, where the discrete integrals move with it as the exact ones do, but for a twelfth of
     the difference of the steps on both sides: 3 % of the bound near the base. Between nodes it is up to a sixth of a step.
@@ -182,10 +186,10 @@ def seen_by(s: Float[Tensor, " P"], location: Float[Tensor, " B"], tension: Floa
     places = location.unique()
     positions = torch.zeros(len(location), len(s) + len(places), 3, dtype=DTYPE)
     positions[:, len(s) :] = torch.nan
-    return Markers(torch.cat([s, places]), positions, None, None if tension is None else tension.expand(len(location), -1))
+    return Markers(torch.cat([s, places]), positions, noise)
 
 
-def _detectable(model: Model, at: Tensor, s: Tensor, tension: Tensor | None, noise: float, e: Tensor) -> Float[Tensor, "K D"]:
+def _detectable(problem: Problem, at: Tensor, e: Tensor) -> Float[Tensor, "K D"]:
     """The smallest force (N) along each direction e (D, 2) that the test finds, at each place (m).
 
     (4) About no push h is linear in F and its location plays no part: F^ ~ N(F, J^-1), J^-1 the force block of C of (1) with
@@ -193,10 +197,9 @@ def _detectable(model: Model, at: Tensor, s: Tensor, tension: Tensor | None, noi
     (5) F^^T J F^ is chi-square with 2 degrees of freedom and noncentrality F^T J F (S. M. Kay, Fundamentals of Statistical Signal
         Processing II: Detection Theory, 1998, sec. 6.5, Wald test). It finds F^T J F >= lambda: |F| >= sqrt(lambda / e^T J e).
     """
-    markers = seen_by(s, at, tension)
-    C, singular = _bounded(model, pushed(model, at.new_zeros(len(at), 2), at, markers.tension), markers, noise, (0, 1))
+    C, singular = _bounded(problem, pushed(problem, at.new_zeros(len(at), 2), at), (0, 1))
     J = torch.linalg.inv_ex(C[:, :2, :2]).inverse
-    size = (noncentrality() / torch.einsum("di,kij,dj->kd", e, J, e)).sqrt() * model.robot.rod.force_scale
+    size = (noncentrality() / torch.einsum("di,kij,dj->kd", e, J, e)).sqrt() * problem.robot.rod.force_scale
     return size.masked_fill(singular.unsqueeze(-1), torch.inf)
 
 
@@ -224,7 +227,7 @@ def bounds(
     force: float,
     locations: Float[Tensor, " K"] | None = None,
     tension: Float[Tensor, " T"] | None = None,
-    registration: bool = False,
+    registration: Registration | None = None,
     width_known: bool = True,
     directions: int = 8,
     steps: int = DEFAULT_STEPS,
@@ -238,19 +241,21 @@ def bounds(
     check(robot, s, noise, force, tension)
     at = places(robot, PLACES) if locations is None else as_float64(locations)
     angle, e = around(directions)
-    model, K = push_model(robot, registration, steps), len(at)
+    K = len(at)
 
     def stds(size: Float[Tensor, " K"]) -> tuple[Float[Tensor, "K D"], Float[Tensor, "K D"]]:
         where, F = at.repeat_interleave(directions), (size[:, None, None] * e).flatten(0, 1)
-        markers = seen_by(s, where, tension)
-        wrench = model.split(pushed(model, F, where, markers.tension))[2]
-        found = load_bound(robot, markers, F, where, wrench, noise, registration, width_known, steps)
+        markers = seen_by(s, where, noise)
+        problem = push_problem(robot, markers, tension, registration, steps)
+        wrench = problem.state.base.of(pushed(problem, F, where))
+        found = load_bound(robot, markers, F, where, wrench, tension, registration, width_known, steps)
         return found[0].reshape(K, -1), found[1].reshape(K, -1)
 
     place, magnitude = stds(torch.full_like(at, force))
     ladder = torch.stack([2 * robot.rod.bending_stiffness * bend / at**2 for bend in BENDS])
     localizable = _localizable(ladder, torch.stack([stds(rung)[0] for rung in ladder]), LOCALIZED * robot.rod.length)
-    return Observability(force, at, angle, place, magnitude, _detectable(model, at, s, tension, noise, e), localizable)
+    detectable = _detectable(push_problem(robot, seen_by(s, at, noise), tension, registration, steps), at, e)
+    return Observability(force, at, angle, place, magnitude, detectable, localizable)
 
 
 def check(robot: Robot, s: Float[Tensor, " P"], noise: float, force: float, tension: Float[Tensor, " T"] | None) -> None:

@@ -19,11 +19,12 @@ from torch import Tensor
 
 from ..estimation import filter as ekf
 from ..estimation.solve import linearize
-from ..estimation.starts import Start
+from ..estimation.starts import Origin, Start
 from ..mechanics.loads import GaussianLoads, Load
 from ..model.load_families import Gamma, GaussianCoordinates
-from ..model.load_families.base import logit
-from ..model.measurement import Markers, Model
+from ..model.load_families.family import logit
+from ..model.problem import Problem
+from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
 
 PLACES = 16  # along the rod, evenly spaced up to the tip: closer than two pushes can be told apart
@@ -31,7 +32,7 @@ BOLD = 3.0  # no force of a start is larger than this many force scales: (2) is 
 
 
 @dataclass(frozen=True)
-class _Probing:
+class _WithCandidates:
     """The coordinates of a fit with point-like loads of zero force at fixed places behind them."""
 
     fitted: GaussianCoordinates
@@ -59,7 +60,7 @@ class _Probing:
 
 
 @dataclass(frozen=True)
-class Probe:
+class ScoreTest:
     """Per sample, at the place that helps most: drop (B,) of the cost, force (B, 2) in force scales, eta (B,), and the fitted state
     x (B, n) moved along with it.
     """
@@ -69,22 +70,21 @@ class Probe:
     eta: Float[Tensor, " B"]
     x: Float[Tensor, "B n"]
 
-    def take(self, index: Int[Tensor, " b"]) -> "Probe":
+    def take(self, index: Int[Tensor, " b"]) -> "ScoreTest":
         """The samples of an index."""
-        return Probe(self.drop[index], self.force[index], self.eta[index], self.x[index])
+        return ScoreTest(self.drop[index], self.force[index], self.eta[index], self.x[index])
 
 
-def probe(model: Model, x: Float[Tensor, "B n"], markers: Markers, noise: float) -> Probe:
-    """The score test (1)-(4) at the fit x of `model`, whose coordinates must be Gaussians. noise: m."""
-    fitted = model.coordinates
+def score_test(problem: Problem, x: Float[Tensor, "B n"]) -> ScoreTest:
+    """The score test (1)-(4) at the fit x of a problem, whose loads must be Gaussians."""
+    fitted = problem.unknowns.loads
     assert isinstance(fitted, GaussianCoordinates)
-    L, n, g = fitted.length, model.size, fitted.size
+    L, n, g = fitted.length, problem.size, fitted.size
     places = tuple(L * (j + 1) / PLACES for j in range(PLACES))
-    wide = replace(model, coordinates=_Probing(fitted, places))
+    wide = problem.of(replace(problem.unknowns, loads=_WithCandidates(fitted, places)))
     nothing = x.new_zeros(len(x), 2 * PLACES)
     # With the tip condition as stiff as it is in truth: its slack would take up part of what a weak load does.
-    w = model.exact_weights(model.weights(markers, noise))
-    at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), markers, w)
+    at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), problem.exact_weights)
     c = torch.arange(g, g + 2 * PLACES)
     b = torch.cat([torch.arange(g), torch.arange(g + 2 * PLACES, n + 2 * PLACES)])
     A_bc = at.A[:, b][:, :, c]
@@ -101,7 +101,7 @@ def probe(model: Model, x: Float[Tensor, "B n"], markers: Markers, noise: float)
 
 def _at_best(
     best: Int[Tensor, " B"], drop: Tensor, F: Tensor, both: Tensor, pair: Int[Tensor, "J 2"], x: Float[Tensor, "B n"]
-) -> Probe:
+) -> ScoreTest:
     """The place of the largest drop of every sample, with (4)."""
     rows = torch.arange(len(best))
     force = F[rows, best].nan_to_num(0.0)
@@ -109,15 +109,15 @@ def _at_best(
     columns = both[..., :-1].gather(-1, pair[best].unsqueeze(1).expand(-1, both.shape[1], -1))
     moved = x + (both[..., -1] - (columns @ force.unsqueeze(-1)).squeeze(-1)).nan_to_num(0.0)
     eta = torch.tensor([logit(min((j + 1) / PLACES, 0.98)) for j in range(PLACES)], dtype=DTYPE)
-    return Probe(drop[rows, best], force, eta[best], moved)
+    return ScoreTest(drop[rows, best], force, eta[best], moved)
 
 
-def start_with_one_more(model: Model, found: Probe) -> Start:
-    """A start for `model`, which has one Gaussian load more than the fit that was probed."""
-    coordinates = model.coordinates
+def start_with_one_more(unknowns: Unknowns, found: ScoreTest) -> Start:
+    """A start for unknowns with one Gaussian load more than the fit that was tested."""
+    coordinates = unknowns.loads
     assert isinstance(coordinates, GaussianCoordinates)
     g = coordinates.size - coordinates.per_load
     log_c = coordinates.start()[-1].expand(len(found.eta))
     more = torch.cat([found.force, torch.stack([found.eta, log_c], -1)], -1)
     x = torch.cat([found.x[:, :g], more, found.x[:, g:]], -1)
-    return Start(x, None, torch.ones(len(x), dtype=torch.bool))
+    return Start.at(x, Origin.SCORE_TEST, challenged=True)

@@ -27,12 +27,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..estimation import filter as ekf
-from ..estimation.solve import CHUNK, Linearized
+from ..estimation.solve import CHUNK
 from ..mechanics.lie import rotate
 from ..mechanics.robot import Robot
 from ..mechanics.statics import solve_shape
 from ..mechanics.tendons import Tendons
-from ..model.measurement import Markers
+from ..model.sensors import Markers
 from ..util.precision import DTYPE
 
 STEP = 1e-4  # of the central differences, in units of theta
@@ -43,13 +43,15 @@ MASS, STIFFNESS, OFFSET = "mass_per_length", "stiffness_factor", "tension_offset
 
 @dataclass(frozen=True)
 class Trial:
-    """The model at one theta: linearized as a batch of 1, with weights w, and the samples that have an equilibrium.
+    """The model at one theta: its normal equations as a batch of 1, residuals r with weights w, and the samples that have an
+    equilibrium.
 
-    A_mean: H^T W H + P with the mean slope at a kink (3), the sensitivity that the covariance is made of.
+    A_mean: H^T W H with the mean slope at a kink (3), the sensitivity that the covariance is made of.
     """
 
-    at: Linearized
+    normal: ekf.Normal
     A_mean: Float[Tensor, "1 n n"]
+    r: Float[Tensor, "1 z"]
     w: Float[Tensor, "1 z"]
     solved: Bool[Tensor, " B"]
 
@@ -60,6 +62,7 @@ class UnloadedShapes:
 
     robot: Robot
     markers: Markers
+    tension: Float[Tensor, "B T"] | None
     weights: Float[Tensor, "B P"]
     stiffness: bool
     offsets: bool
@@ -80,9 +83,9 @@ class UnloadedShapes:
     def unit(self) -> Float[Tensor, " n"]:
         """The size of one unit of theta: 1 for a logarithm, O_j (N) for an offset."""
         one = torch.ones(1 + self.stiffness, dtype=DTYPE)
-        if not self.offsets or self.markers.tension is None:
+        if not self.offsets or self.tension is None:
             return one
-        largest = self.markers.tension.nan_to_num(0.0).amax(0)
+        largest = self.tension.nan_to_num(0.0).amax(0)
         return torch.cat([one, torch.where(largest > 0, largest, self.robot.rod.force_scale)])
 
     def before(self) -> Float[Tensor, " n"]:
@@ -104,22 +107,22 @@ class UnloadedShapes:
     def seen(self, theta: Float[Tensor, "M n"]) -> Float[Tensor, "M B P 3"]:
         """The markers (m, base frame) of every sample under M trial thetas, by (2); NaN where there is no equilibrium."""
         index = torch.arange(len(self.markers.positions)).split(max(1, CHUNK * 4 // len(theta)))
-        return torch.cat([self._seen(theta, self.markers.take(i), i) for i in index], 1)
+        return torch.cat([self._seen(theta, i) for i in index], 1)
 
-    def _seen(self, theta: Float[Tensor, "M n"], part: Markers, index: Tensor) -> Float[Tensor, "M b P 3"]:
+    def _seen(self, theta: Float[Tensor, "M n"], index: Tensor) -> Float[Tensor, "M b P 3"]:
         M, b, robot, value = len(theta), len(index), self.robot, self.physical(theta)
         k = value[:, 1, None] if self.stiffness else value.new_ones(M, 1)
         g = robot.gravity.expand(len(self.markers.positions), 3)[index]
         weight = (value[:, :1] / k)[..., None] * g
         tension = None
-        if part.tension is not None:
+        if self.tension is not None:
             o = value[:, 1 + self.stiffness :] if self.offsets else self._known_offsets()
-            tension = ((part.tension + o.unsqueeze(-2)) / k.unsqueeze(-1)).flatten(0, 1)
+            tension = ((self.tension[index] + o.unsqueeze(-2)) / k.unsqueeze(-1)).flatten(0, 1)
         plain = Tendons(tuple(replace(t, tension_offset=0.0) for t in robot.tendons.tendons))
         rod = replace(robot.rod, mass_per_length=torch.ones((), dtype=DTYPE))
         trial = Robot(rod, plain, weight.flatten(0, 1))
-        shape = solve_shape(trial, (), tension, part.s, M * b, self.steps)
-        p = shape.p if part.offsets is None else shape.p + rotate(shape.q, part.offsets)
+        shape, offsets = solve_shape(trial, (), tension, self.markers.s, M * b, self.steps), self.markers.offsets
+        p = shape.p if offsets is None else shape.p + rotate(shape.q, offsets)
         return p.unflatten(0, (M, b))
 
     def _known_offsets(self) -> Float[Tensor, "1 T"]:
@@ -127,7 +130,7 @@ class UnloadedShapes:
 
     def _distance(self, theta: Float[Tensor, " n"]) -> Float[Tensor, "B n"]:
         """reading + o in units of theta, whose zeros are the kinks (3); infinite for what has none."""
-        B, tension = len(self.markers.positions), self.markers.tension
+        B, tension = len(self.markers.positions), self.tension
         first = torch.full((B, 1 + self.stiffness), torch.inf, dtype=DTYPE)
         if not self.offsets or tension is None:
             return first
@@ -153,13 +156,16 @@ class UnloadedShapes:
         ahead, back, H = (torch.where(w > 0, d, 0.0).mT / STEP for d in (up - h, h - down, 0.5 * (up - down)))
         precision = torch.full_like(theta, PRIOR)
         kinks = (self._distance(theta).abs() <= STEP).any(0)
-        A_mean, g = ekf.information(H[None], r, w, theta[None], mean, precision)
+        nothing = torch.zeros_like(precision)
+        A_mean, g = ekf.information(H[None], r, w, theta[None], mean, nothing)
         A = A_mean
         if bool(kinks.any()):
             H = _towards_descent(H, ahead, back, kinks, lambda H: ekf.information(H[None], r, w, theta[None], mean, precision))
-            A, g = ekf.information(H[None], r, w, theta[None], mean, precision)
-        cost = (w * r * r).sum(-1) + (precision * (mean - theta) ** 2).sum(-1)
-        return Trial(Linearized(r, H[None], A, g, cost, ekf.decrement(A, g)), A_mean, w, solved)
+            A, g = ekf.information(H[None], r, w, theta[None], mean, nothing)
+        # In equilibrium there is no tip residual: its half of the normal equations is zero.
+        A, g, cost = (torch.stack([part, torch.zeros_like(part)], 1) for part in (A, g, (w * r * r).sum(-1)))
+        normal = ekf.Normal(A, g, cost, (w > 0).sum(-1))
+        return Trial(normal, A_mean, r, w, solved)
 
 
 def _towards_descent(

@@ -29,7 +29,8 @@ def calibrate(options: Namespace) -> None:
     writable(options.json, CALIBRATION_SUFFIXES)
     settings = Settings(max_iterations=options.max_iterations)
     try:
-        found = run_calibration(robot, shapes.markers, options.noise, options.youngs_modulus, options.tension_offset, settings)
+        markers = shapes.markers(options.noise)
+        found = run_calibration(robot, markers, shapes.tension, options.youngs_modulus, options.tension_offset, settings)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     for name, used in zip(shapes.samples, found.used.tolist(), strict=True):

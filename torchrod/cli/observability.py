@@ -12,6 +12,7 @@ from ..analysis.marker_placement import Placement, even_layout, place
 from ..analysis.observability import BENDS, LOCALIZED, Observability, bounds
 from ..io import read_robot, write_observability, write_observability_table
 from ..mechanics.robot import Robot
+from ..model.unknowns import Registration
 from ..util.errors import InputError
 from ..util.precision import DTYPE
 from .arguments import FIGURE_SUFFIXES, noise_std, positive, writable
@@ -36,11 +37,13 @@ def observability(options: Namespace) -> None:
     placed = None
     if options.place is not None:
         try:
-            placed = place(robot, options.place, options.noise, force, tension, options.registration, options["from"], options.gap)
+            placed = place(
+                robot, options.place, options.noise, force, tension, _registration(options), options["from"], options.gap
+            )
         except ValueError as error:
             raise InputError(f"{options.robot}: {error}") from None
         s = placed.s
-    seen = bounds(robot, s, options.noise, force, tension=tension, registration=options.registration)
+    seen = bounds(robot, s, options.noise, force, tension=tension, registration=_registration(options))
     if bool(torch.isnan(seen.location_std).all()):
         raise InputError(f"--force {force:g}: no equilibrium was found under it anywhere along the rod; check its size and units")
     print(_report(robot, seen, s, options, placed))  # noqa: T201
@@ -52,6 +55,10 @@ def observability(options: Namespace) -> None:
         write_observability(options.json, seen, s.tolist(), robot.name, options.noise, pulled, options.registration, placed)
     if options.out:
         _draw(options, robot, seen, s, tension, placed)
+
+
+def _registration(options: Namespace) -> Registration | None:
+    return Registration() if options.registration else None
 
 
 def _tension(options: Namespace, robot: Robot) -> Tensor | None:
@@ -144,7 +151,7 @@ def _draw(
 
     layouts = [Layout("proposed" if placed else "markers", s, seen)]
     if placed is not None:
-        even = bounds(robot, placed.even, options.noise, seen.force, tension=tension, registration=options.registration)
+        even = bounds(robot, placed.even, options.noise, seen.force, tension=tension, registration=_registration(options))
         layouts.append(Layout("evenly spaced", placed.even, even))
     title = f"{robot.name}: {len(s)} markers, {1e3 * options.noise:g} mm noise"
     title += f", tendons at {', '.join(f'{t:g}' for t in options.tension)} N" if tension is not None else ""

@@ -17,5 +17,7 @@ def plot(options: Namespace) -> None:
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
     writable(options.out, FIGURE_SUFFIXES)
-    fit = read_fit(options.result, sample, robot.name, len(shapes.markers.s))
-    draw(options.out, robot, fit, shapes.markers, shapes.samples.index(sample), f"{robot.name}, sample {sample}")
+    fit = read_fit(options.result, sample, robot.name, len(shapes.s))
+    b = shapes.samples.index(sample)
+    tension = None if shapes.tension is None else shapes.tension[b]
+    draw(options.out, robot, fit, shapes.positions[b], tension, f"{robot.name}, sample {sample}")

@@ -17,7 +17,6 @@ from ..mechanics.actuation import solve_displacement
 from ..mechanics.loads import Load, PointForces, PointWrenches
 from ..mechanics.robot import Robot
 from ..mechanics.statics import Equilibrium, solve_shape
-from ..model.measurement import Markers
 from ..util.errors import InputError
 from ..util.precision import DTYPE
 from ..util.progress import bar
@@ -49,7 +48,7 @@ def simulate(options: Namespace) -> None:
     if Status(int(shape.status[0])) is not Status.CONVERGED:
         raise InputError(f"{options.robot}: no equilibrium was found under these loads; check their size and units")
     noise = options.noise * torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(options.seed), dtype=DTYPE)
-    write_shapes(options.out, Shapes(Markers(s, shape.p + noise, None, tensions), ["0"]))
+    write_shapes(options.out, Shapes(s, shape.p + noise, ["0"], None, tensions))
     tip = [f"{v * 1e3:.2f}" for v in shape.p[0, -1].tolist()]
     pulled = f", tensions {', '.join(f'{t:.3f}' for t in tensions[0].tolist())} N" if tensions is not None else ""
     print(f"{options.out}: {len(at)} markers, the last at ({', '.join(tip)}) mm{pulled}")  # noqa: T201

@@ -1,20 +1,22 @@
 """The robot in equilibrium under loads that are known, roughly and fast: what a start of the filter is made of."""
 
 import math
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from .. import kernel
-from ..mechanics.robot import Robot
 from ..mechanics.statics import LOAD_PER_INCREMENT, ROUGH_TOLERANCE, solve_shape
 from ..model.load_families import GaussianCoordinates
-from ..model.measurement import Markers, Model
-from ..util.kept import versions
-from .evaluator import Prepared, family_of, served
+from ..model.problem import Problem
+from ..model.sensors import Markers
+from ..model.unknowns import Unknowns
+from ..util.by_value import Kept, key
+from .evaluator import KernelEvaluator, family_of, kernel_serves
+
+_bare = Kept()
 
 
 @dataclass(frozen=True)
@@ -25,55 +27,48 @@ class Rest:
     p: Float[Tensor, "B P 3"]
 
 
-def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None = None) -> Rest:
-    """The base wrench and the shape at markers.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
+def at_rest(problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None = None) -> Rest:
+    """The base wrench and the shape at problem.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
 
     q_tip: the orientation of the tip near which to look, where it is known: sooner found. By the compiled kernel where it serves;
     what does not settle there, and all else, by torchrod.solve_shape, which is the definition.
     """
-    B, P = len(gamma), len(markers.s)
-    rough = replace(model.coarse, registration=False, tip="none", tension_std=None)
+    s, B, P, family = problem.s, len(gamma), len(problem.s), problem.unknowns.loads
+    plain = Problem(problem.robot, Unknowns(family), [Markers(s, s.new_empty(B, 0, 3), 1.0)], problem.tension, problem.coarse.steps)
     wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
     settled = torch.zeros(B, dtype=torch.bool)
-    if family_of(rough) != "point" and model.robot.gravity.ndim == 1 and served(rough, markers.positions):
-        x = rough.join(gamma, wrench.new_zeros(B, 6))
-        tables = Prepared(rough, markers, gamma.new_zeros(B, 0)).tables(x)
-        wrench, missed, p = kernel.balance_now(
-            x, q_tip, _increments(model) if q_tip is None else 1, ROUGH_TOLERANCE, tables.structure, tables.markers
-        )
+    if family_of(plain) != "point" and problem.robot.gravity.ndim == 1 and kernel_serves(plain):
+        increments = _increments(problem) if q_tip is None else 1
+        wrench, missed, p = KernelEvaluator(plain).balance(gamma, q_tip, increments, ROUGH_TOLERANCE)
         settled = (missed <= ROUGH_TOLERANCE) & torch.isfinite(wrench).all(-1)
     if bool(settled.all()):
         return Rest(wrench, p)
     index = (~settled).nonzero().squeeze(-1)
-    tension = None if markers.tension is None else markers.tension[index]
+    tension = None if problem.tension is None else problem.tension[index]
     start = None if q_tip is None else q_tip[index]
-    loads = model.coordinates.loads(gamma[index]) if gamma.shape[-1] else ()
-    solved = solve_shape(model.robot, loads, tension, markers.s, len(index), rough.steps, ROUGH_TOLERANCE, start)
+    loads = family.loads(gamma[index]) if gamma.shape[-1] else ()
+    solved = solve_shape(problem.robot, loads, tension, s, len(index), plain.steps, ROUGH_TOLERANCE, start)
     return Rest(wrench.index_copy(0, index, solved.base_wrench), p.index_copy(0, index, solved.p))
 
 
-def without_load(model: Model, markers: Markers) -> Rest:
-    """The robot under its tensions and its weight alone: one forward solve where the samples are alike before the load."""
-    if markers.tension is not None or model.robot.gravity.ndim > 1:
-        return _bare(model.robot, model.steps, markers)
-    B, now, compiled = len(markers.positions), model.robot.versions + versions(markers.s), served(model, markers.positions)
-    rest = _kept_bare(model.robot, model.steps, markers.s, now, compiled)
+def without_load(problem: Problem, s: Float[Tensor, " P"] | None = None) -> Rest:
+    """The robot under its tensions and its weight alone, at problem.s or at s (m): one forward solve where the samples are alike
+    before the load, kept for the next shapes of the same robot.
+    """
+    robot, B, s = problem.robot, problem.batch, problem.s if s is None else s
+    none = Unknowns(GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale))
+
+    def bare(count: int) -> Rest:
+        at = [Markers(s, s.new_empty(count, 0, 3), 1.0)]
+        return at_rest(Problem(robot, none, at, problem.tension, problem.steps), s.new_zeros(count, 0))
+
+    if problem.tension is not None or robot.gravity.ndim > 1:
+        return bare(B)
+    rest = _bare(key((robot, problem.steps, s, kernel.available())), lambda: bare(1))
     return Rest(rest.wrench.expand(B, 6), rest.p.expand(B, *rest.p.shape[1:]))
 
 
-def _bare(robot: Robot, steps: int, markers: Markers) -> Rest:
-    model = Model(robot, GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale), steps=steps)
-    return at_rest(model, markers, markers.positions.new_zeros(len(markers.positions), 0))
-
-
-@lru_cache(maxsize=32)
-@torch.inference_mode(False)  # it outlives the call
-def _kept_bare(robot: Robot, steps: int, s: Float[Tensor, " P"], now: tuple[int, ...], compiled: bool) -> Rest:
-    """The same for the next shapes, unless a tensor of the robot or s has been changed since, or another path serves."""
-    return _bare(robot, steps, Markers(s, s.new_zeros(1, len(s), 3)))
-
-
-def _increments(model: Model) -> int:
+def _increments(problem: Problem) -> int:
     """In how many parts the weight is put on, so that each is no more than solve_shape's."""
-    rod, weight = model.robot.rod, model.robot.weight
+    rod, weight = problem.robot.rod, problem.robot.weight
     return max(1, math.ceil(float(weight.norm()) * rod.length**3 / rod.bending_stiffness / LOAD_PER_INCREMENT))

@@ -35,12 +35,12 @@ def information(
     r: Float[Tensor, "B z"],
     w: Float[Tensor, "B z"],
     x: Float[Tensor, "B n"],
-    prior_mean: Float[Tensor, " n"],
-    prior_precision: Float[Tensor, " n"],
+    prior_mean: Float[Tensor, "*B n"],
+    prior_precision: Float[Tensor, "*B n"],
 ) -> Information:
     """H^T W H + P and g = H^T W r + P (x0 - x), with r = z - h(x) and W = diag(w)."""
     WH = w.unsqueeze(-1) * H
-    A = torch.matmul(H.transpose(-1, -2), WH) + torch.diag(prior_precision)
+    A = torch.matmul(H.transpose(-1, -2), WH) + torch.diag_embed(prior_precision)
     g = (WH * r.unsqueeze(-1)).sum(-2) + prior_precision * (prior_mean - x)
     return A, g
 
@@ -91,24 +91,6 @@ def decrement(A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> Float[Tenso
     return (g * solve_spd(A, g.unsqueeze(-1)).squeeze(-1)).sum(-1)
 
 
-def inflation(w: Float[Tensor, "B z"], markers: int, decrement: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    """decrement / m, with m the number of marker coordinates seen: what a Gauss-Newton step promises to remove from each.
-
-    Zero where there is no such step: without a prior, a load of no force makes H^T W H singular.
-    """
-    return decrement.nan_to_num(0.0) / (w[:, :markers] > 0).sum(-1).clamp(min=1)
-
-
-def adapted_weights(w: Float[Tensor, "B z"], markers: int, inflated: Float[Tensor, " B"]) -> Float[Tensor, "B z"]:
-    """Residual-adaptive noise: R = sigma^2 (1 + inflated) on the first `markers` entries of z.
-
-    With inflated = decrement / m, R is sigma^2 + mean(r^2) far from the data, where nearly all of r^T W r can be removed, and the
-    true sigma^2 at a minimum, whether or not the model explains the data there. The tip residual keeps its weight: the first
-    iterations look for an equilibrium that bends the right way rather than for a rod through all the markers.
-    """
-    return torch.cat([w[:, :markers] / (1 + inflated).unsqueeze(-1), w[:, markers:]], -1)
-
-
 class Limits(NamedTuple):
     """When the filter has arrived, and how far it may go in one iteration.
 
@@ -137,12 +119,12 @@ class Normal:
     seen: Int[Tensor, " B"]
 
     def whole(
-        self, x: Float[Tensor, "B n"], mean: Float[Tensor, " n"], precision: Float[Tensor, " n"], share: Tensor | float = 1.0
+        self, x: Float[Tensor, "B n"], mean: Float[Tensor, "*B n"], precision: Float[Tensor, "*B n"], share: Tensor | float = 1.0
     ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n"], Float[Tensor, " B"]]:
         """A, g and cost with the prior; the markers' part multiplied by `share`, a number or (B, 1)."""
         off = mean - x
         w = share.unsqueeze(-1) if isinstance(share, Tensor) else share
-        A = w * self.A[:, 0] + self.A[:, 1] + torch.diag(precision)
+        A = w * self.A[:, 0] + self.A[:, 1] + torch.diag_embed(precision)
         return A, share * self.g[:, 0] + self.g[:, 1] + precision * off, self.cost.sum(-1) + (precision * off**2).sum(-1)
 
     def exact(self, factor: float) -> "Normal":
@@ -151,29 +133,46 @@ class Normal:
         return Normal(self.A * scale[:, None, None], self.g * scale[:, None], self.cost * scale, self.seen)
 
 
-def student(s: Float[Tensor, "B P"], nu: float) -> tuple[Float[Tensor, "B P"], Float[Tensor, "B P"]]:
-    """Student's t with nu degrees of freedom for a marker's three coordinates, s = r^T W r of that marker:
+def student(
+    s: Float[Tensor, "B G"], nu: float, rows: Float[Tensor, " G"] | float = 3.0
+) -> tuple[Float[Tensor, "B G"], Float[Tensor, "B G"]]:
+    """Student's t with nu degrees of freedom for the rows of a group (a marker's three coordinates), s = r^T W r of that group:
 
-    (6)  cost (nu + 3) log(1 + s / nu),  weight times (nu + 3) / (nu + s)
+    (6)  cost (nu + rows) log(1 + s / nu),  weight times (nu + rows) / (nu + s)
 
     The cost is -2 log of the density; the weight makes the gradient of r^T W r that of the cost (iteratively reweighted least
     squares, which never raises it). nu = inf is the normal distribution. Source: Lange, Little & Taylor, JASA 1989.
     """
     if math.isinf(nu):
         return s, torch.ones_like(s)
-    return (nu + 3) * torch.log1p(s / nu), (nu + 3) / (nu + s)
+    return (nu + rows) * torch.log1p(s / nu), (nu + rows) / (nu + s)
 
 
-def normal_equations(H: Float[Tensor, "B z n"], r: Float[Tensor, "B z"], w: Float[Tensor, "B z"], nu: float = math.inf) -> Normal:
-    """Of residuals r = z - h(x), zero where a marker is missing, whose last six entries are the tip's."""
-    s = (w * r * r)[:, :-6].unflatten(-1, (-1, 3)).sum(-1)
-    marker_cost, factor = student(s, nu)
-    seen = (w[:, :-6] > 0).sum(-1)
-    w = torch.cat([w[:, :-6] * factor.repeat_interleave(3, -1), w[:, -6:]], -1)
-    parts = [(H[:, :-6], r[:, :-6], w[:, :-6]), (H[:, -6:], r[:, -6:], w[:, -6:])]
+def by_group(square: Float[Tensor, "B rows"], groups: Int[Tensor, " rows"]) -> Float[Tensor, "B G"]:
+    """The sums of w r^2 over the rows of each group."""
+    return square.new_zeros(len(square), int(groups[-1]) + 1).index_add(1, groups, square)
+
+
+def sensors_cost(
+    square: Float[Tensor, "B rows"], groups: Int[Tensor, " rows"], nu: float
+) -> tuple[Float[Tensor, " B"], Float[Tensor, "B rows"]]:
+    """The cost (6) of the sensors' rows, from their w r^2, and the factor of each row's weight."""
+    cost, factor = student(by_group(square, groups), nu, torch.bincount(groups).to(square.dtype))
+    return cost.sum(-1), factor[:, groups]
+
+
+def normal_equations(
+    H: Float[Tensor, "B z n"], r: Float[Tensor, "B z"], w: Float[Tensor, "B z"], groups: Int[Tensor, " rows"], nu: float = math.inf
+) -> Normal:
+    """Of residuals r = z - h(x), zero where nothing was read, whose last rows, beyond those of `groups`, are the tip's."""
+    m = len(groups)
+    seen = (w[:, :m] > 0).sum(-1)
+    cost, factor = sensors_cost((w * r * r)[:, :m], groups, nu)
+    w = torch.cat([w[:, :m] * factor, w[:, m:]], -1)
+    parts = [(H[:, :m], r[:, :m], w[:, :m]), (H[:, m:], r[:, m:], w[:, m:])]
     A = torch.stack([H.mT @ (w.unsqueeze(-1) * H) for H, _, w in parts], 1)
     g = torch.stack([((w * r).unsqueeze(-1) * H).sum(-2) for H, r, w in parts], 1)
-    return Normal(A, g, torch.stack([marker_cost.sum(-1), (w * r * r)[:, -6:].sum(-1)], -1), seen)
+    return Normal(A, g, torch.stack([cost, (w * r * r)[:, m:].sum(-1)], -1), seen)
 
 
 @dataclass(frozen=True)
@@ -202,7 +201,7 @@ def advance(
     at: Iterate,
     N: Normal,
     Sigma0: Float[Tensor, "B n n"],
-    prior: tuple[Float[Tensor, " n"], Float[Tensor, " n"]],
+    prior: tuple[Float[Tensor, "*B n"], Float[Tensor, "*B n"]],
     Q: Float[Tensor, " n"],
     limits: Limits,
 ) -> Iterate:

@@ -15,7 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from ..model.measurement import Model
+from ..model.load_families import LoadFamily
+from ..model.problem import Problem
+from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
 
 NODES = 101
@@ -56,18 +58,20 @@ def _root(C: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
     return d.unsqueeze(-1) * axes * size.clamp(min=0).sqrt().unsqueeze(-2)
 
 
-def _density(model: Model, gamma: Float[Tensor, "... n"], s: Float[Tensor, " S"]) -> Float[Tensor, "... S 2"] | None:
+def _density(family: LoadFamily, gamma: Float[Tensor, "... n"], s: Float[Tensor, " S"]) -> Float[Tensor, "... S 2"] | None:
     """f (N/m) of all loads together; None where one of them is a point force."""
-    parts = [load.density(s) for load in model.coordinates.loads(gamma)]
+    parts = [load.density(s) for load in family.loads(gamma)]
     present = [part for part in parts if part is not None]
     return sum(present[1:], present[0])[..., :2] if len(present) == len(parts) else None
 
 
-def _band(model: Model, gamma: Float[Tensor, "b g"], C: Float[Tensor, "b g g"], s: Float[Tensor, " S"]) -> Float[Tensor, "b S 3 2"]:
+def _band(
+    family: LoadFamily, gamma: Float[Tensor, "b g"], C: Float[Tensor, "b g g"], s: Float[Tensor, " S"]
+) -> Float[Tensor, "b S 3 2"]:
     """Pointwise quantiles of f_x, f_y, |f| over the draws; linear between the order statistics."""
     step = torch.einsum("bij,dj->bdi", _root(C), _normal(gamma.shape[-1]))
     std = C.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(1)
-    f = _density(model, model.coordinates.moved(gamma.unsqueeze(1), step, std), s)
+    f = _density(family, family.moved(gamma.unsqueeze(1), step, std), s)
     assert f is not None
     values = torch.cat([f, f.norm(dim=-1, keepdim=True)], -1).movedim(1, -1).contiguous().numpy()
     ordered = np.sort(values, -1)
@@ -78,38 +82,45 @@ def _band(model: Model, gamma: Float[Tensor, "b g"], C: Float[Tensor, "b g g"], 
     return torch.from_numpy(np.stack(ends, -1))
 
 
-def load_profile(model: Model, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"], nodes: int = NODES) -> Profile | None:
+def load_profile(
+    problem: Problem, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"], nodes: int = NODES
+) -> Profile | None:
     """f(s) at `nodes` evenly spaced places from base to tip, with its band; None for point loads, which have no density.
 
     x, covariance: of torchrod.Estimate. The draws are always the same: equal fits have equal bands, whatever their batch.
     """
-    g, s = model.coordinates.size, torch.linspace(0.0, model.robot.rod.length, nodes, dtype=DTYPE)
-    gamma, C = x[:, :g], covariance[:, :g, :g]
-    if g == 0:
+    family, at, s = (
+        problem.unknowns.loads,
+        problem.state.loads.at,
+        torch.linspace(0.0, problem.robot.rod.length, nodes, dtype=DTYPE),
+    )
+    gamma, C = x[:, at], covariance[:, at, at]
+    if family.size == 0:
         return Profile(s, x.new_zeros(len(x), nodes, 2), x.new_zeros(len(x), nodes, 3, 2))
-    f = _density(model, gamma, s)
+    f = _density(family, gamma, s)
     if f is None:
         return None
     band = f.new_full((len(f), nodes, 3, 2), torch.nan)
     known = (torch.isfinite(gamma).all(-1) & torch.isfinite(C).flatten(1).all(-1)).nonzero().squeeze(-1)
     for index in known.split(CHUNK):
-        band[index] = _band(model, gamma[index], C[index], s)
+        band[index] = _band(family, gamma[index], C[index], s)
     return Profile(s, f, band)
 
 
 def joined_profile(
-    parts: Sequence[tuple[Model, Int[Tensor, " b"]]],
+    problem: Problem,
+    parts: Sequence[tuple[Unknowns, Int[Tensor, " b"]]],
     x: Float[Tensor, "B n"],
     covariance: Float[Tensor, "B n n"],
     nodes: int = NODES,
 ) -> Profile | None:
-    """The same where every sample has its own model (analysis.count): parts of the batch, each with what it was fitted by."""
+    """The same where samples have their own unknowns (analysis.count): parts of the batch, each with what it was fitted by."""
     s, f, band = None, x.new_full((len(x), nodes, 2), torch.nan), x.new_full((len(x), nodes, 3, 2), torch.nan)
-    for model, index in parts:
+    for unknowns, index in parts:
         if not len(index):
             continue
-        n = model.size
-        profile = load_profile(model, x[index, :n], covariance[index, :n, :n], nodes)
+        own = problem.of(unknowns)
+        profile = load_profile(own, x[index, : own.size], covariance[index, : own.size, : own.size], nodes)
         if profile is None:
             return None
         s, f[index], band[index] = profile.s, profile.f, profile.band

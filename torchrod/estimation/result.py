@@ -1,42 +1,111 @@
-"""The result of an estimate: loads, how sure, how well they explain the markers, and what became of every sample."""
+"""The result of an estimate: loads, how sure, how well they explain the readings, and what became of every sample."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.special import chdtri
 from torch import Tensor
 
 from ..kernel import Sums
 from ..mechanics.jacobian import pointwise_jacobian
-from ..model.load_families import GaussianCoordinates
-from ..model.measurement import Model
-from ..util.status import Learned, Status
-from .evaluator import Prepared
-from .fit import Fit
+from ..mechanics.loads import GaussianLoads, Load, PointForces, on_rod_fraction
+from ..model.load_families import GaussianCoordinates, LoadFamily
+from ..model.problem import TIP_ROWS
+from ..util.precision import DTYPE
+from ..util.status import Status
+from . import filter as ekf
+from .evaluator import Evaluator
 from .load_profile import Profile
-from .verdict import limit, verdict
+from .starts import Fate, Origin
 
 Z95 = 1.959964  # of the standard normal distribution
+ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
+
+
+@dataclass(frozen=True)
+class FittedRod:
+    """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
+    wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, the unknown
+    force (3,) N at the tip in the base frame, or None, the 95 % intervals (K, 2) m of the locations, NaN where they are not
+    known, and the load profile with its band; both None where only the shape is to be drawn.
+    """
+
+    force: Float[Tensor, "K 2"]
+    location: Float[Tensor, " K"]
+    width: Float[Tensor, " K"]
+    base_wrench: Float[Tensor, " 6"]
+    registration: Float[Tensor, " 6"] | None = None
+    tip_force: Float[Tensor, " 3"] | None = None
+    location_interval: Float[Tensor, "K 2"] | None = None
+    profile: Profile | None = None
+
+    def loads(self, length: float) -> tuple[Load, ...]:
+        """The loads as mechanics.loads has them."""
+        point = self.width <= 0
+        c = 0.5 / self.width[~point] ** 2
+        spread = (math.pi / c).sqrt() * on_rod_fraction(self.location[~point], c, length)
+        force = torch.cat([self.force, torch.zeros_like(self.force[:, :1])], -1)
+        smooth = GaussianLoads(self.force[~point] / spread.unsqueeze(-1), self.location[~point], c)
+        return (smooth, PointForces(force[point], self.location[point]))
+
+
+@lru_cache(maxsize=4096)
+def limit(dof: int) -> float:
+    """The 99.9 % point of chi^2."""
+    return float(chdtri(max(dof, 1), 1 - ACCEPT))
+
+
+@lru_cache(maxsize=64)
+def _limits(most: int) -> Float[Tensor, " K"]:
+    """That of 0 to so many degrees of freedom."""
+    return torch.tensor([limit(dof) for dof in range(most + 1)], dtype=DTYPE)
+
+
+def verdict(
+    evaluate: Evaluator, sums: Sums, cost: Float[Tensor, " B"]
+) -> tuple[Bool[Tensor, "B G"], Float[Tensor, " B"], Int[Tensor, " B"], Bool[Tensor, " B"]]:
+    """outlier, chi2 and dof of Estimate, and whether the fit explains the readings: one that leaves most aside does not."""
+    problem = evaluate.problem
+    read, state = problem.seen, problem.state
+    outlier, chi2 = torch.zeros(problem.batch, problem.group_count, dtype=torch.bool), cost.clone()
+    most_inside = read > 0
+    if math.isfinite(evaluate.nu):
+        present, groups, m = problem.present(), problem.groups, len(problem.groups)
+        rows = torch.bincount(groups).tolist()
+        square = ekf.by_group((problem.weights * sums.r**2)[:, :m], groups)
+        outlier = present & (square > torch.tensor([limit(k) for k in rows], dtype=DTYPE))
+        inside = present & ~outlier
+        chi2 = cost - sums.cost[:, 0] + (square * inside).sum(-1)
+        read = read - (outlier[:, groups] & (problem.weights[:, :m] > 0)).sum(-1)
+        most_inside = 2 * inside.sum(-1) > present.sum(-1)
+    dof = read + TIP_ROWS + state.informative - state.size
+    most = problem.weights.shape[-1] + state.size
+    return outlier, chi2, dof, (chi2 < _limits(most)[dof.clamp(min=0)]) & most_inside
 
 
 @dataclass(frozen=True)
 class Estimate:
     """Everything known of B samples after the fit. Status codes are torchrod.Status; SI units; forces in the section frame.
 
-    x, covariance: the state in the model's coordinates and its posterior (H^T W H + P)^-1 with the true noise; covariances are NaN
-    where the fit has not converged. As in any Kalman filter x is one update further than the evaluation of the model that the
+    x, covariance: the state in the units of Problem.state and its posterior (H^T W H + P)^-1 with the true noise; covariances are
+    NaN where the fit has not converged. As in any Kalman filter x is one update further than the evaluation of the model that the
     covariance, the residual, the centre line, cost and chi2 are of: by less than what 1e-3 of chi^2 can tell.
     force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
     net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
     tip (B, 6) [N, N m] and tip_covariance (B, 6, 6): the unknown dead wrench at the tip, base frame, zero in the entries that are
-    not unknown; None without Model.tip. base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line
-    (B, P, 3) m: the fitted rod at the markers, in the base frame. residual (B, P, 3) m: measured minus fitted, NaN where missing.
+    not unknown; None without Unknowns.tip. base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line
+    (B, P, 3) m: the fitted rod at the sensors' arc lengths, in the base frame. residual (B, K, 3) m: of all rows that are positions
+    (markers), measured minus fitted, NaN where missing; row_residual (B, rows): of every row, in its own unit, 0 where missing.
     iterations (B,): evaluations of h and H, of all attempts; restarts (B,): further attempts, cold or from other magnitudes.
-    warm_started (B,): whether the fit that is reported started from a guess; learned (B,): util.status.Learned codes.
-    tension, tension_std (B, T) N: as found; None where they are taken as exact. outlier (B, P): markers that a robust fit has left
-    aside. cost (B,): what was minimized; chi2: the same of the other markers, as the normal distribution has it.
-    chi2, dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit that does not explain the data.
+    origin (B,): where the fit that is reported began; guess, fate (B,): the start that was given and what became of it (codes of
+    estimation.starts Origin and Fate). tension, tension_std (B, T) N: as found; None where they are taken as exact. outlier (B, G):
+    groups of rows (a marker each) that a robust fit has left aside. cost (B,): what was minimized; chi2: the same of the other
+    groups, as the normal distribution has it. dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit
+    that does not explain the data.
     """
 
     x: Float[Tensor, "B n"]
@@ -51,10 +120,11 @@ class Estimate:
     base_wrench: Float[Tensor, "B 6"]
     registration: Float[Tensor, "B 6"] | None
     centre_line: Float[Tensor, "B P 3"]
-    residual: Float[Tensor, "B P 3"]
+    residual: Float[Tensor, "B Q 3"]
+    row_residual: Float[Tensor, "B rows"]
     tension: Float[Tensor, "B T"] | None
     tension_std: Float[Tensor, "B T"] | None
-    outlier: Bool[Tensor, "B P"]
+    outlier: Bool[Tensor, "B G"]
     cost: Float[Tensor, " B"]
     chi2: Float[Tensor, " B"]
     dof: Int[Tensor, " B"]
@@ -62,8 +132,14 @@ class Estimate:
     iterations: Int[Tensor, " B"]
     restarts: Int[Tensor, " B"]
     status: Int[Tensor, " B"]
-    warm_started: Bool[Tensor, " B"]
-    learned: Int[Tensor, " B"]
+    origin: Int[Tensor, " B"]
+    guess: Int[Tensor, " B"]
+    fate: Int[Tensor, " B"]
+
+    @property
+    def warm_started(self) -> Bool[Tensor, " B"]:
+        """Whether the fit that is reported began from a learned start or from the frame before."""
+        return (self.origin == int(Origin.LEARNED)) | (self.origin == int(Origin.PREVIOUS))
 
     @property
     def magnitude(self) -> Float[Tensor, "B K"]:
@@ -120,8 +196,15 @@ class Estimate:
         return self.residual.square().sum(-1).nanmean(-1).sqrt()
 
     def message(self, sample: int) -> str:
-        """What became of a sample, with the remedy; a second sentence where a learned start did not serve."""
-        return f"{self._outcome(sample)} {Learned(int(self.learned[sample])).message}".strip()
+        """What became of a sample, with the remedy; a second sentence where the start that it was given did not serve."""
+        guess, fate = Origin(int(self.guess[sample])), Fate(int(self.fate[sample]))
+        said = ""
+        if guess in (Origin.LEARNED, Origin.PREVIOUS):
+            said = {
+                Fate.DROPPED: f"The {guess.label} was no nearer to the markers than a cold one and was dropped.",
+                Fate.RETRIED: f"The fit from the {guess.label} was not accepted, so a cold start was tried as well.",
+            }.get(fate, "")
+        return f"{self._outcome(sample)} {said}".strip()
 
     def _outcome(self, sample: int) -> str:
         status = Status(int(self.status[sample]))
@@ -134,32 +217,44 @@ class Estimate:
         remedy = "allow more contacts, state more noise, or check tensions, gravity and registration"
         return f"Converged, but {reason}: the model does not explain the markers; {remedy}."
 
-    def fit(self, sample: int, profile: Profile | None = None) -> Fit:
+    def fitted_rod(self, sample: int, profile: Profile | None = None) -> FittedRod:
         """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""
         zeta = None if self.registration is None else self.registration[sample]
         there = torch.isfinite(self.location[sample])
         tip = None if self.tip is None or bool(self.tip[sample].isnan().all()) else self.tip[sample, :3]
         loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
         interval, along = self.location_interval[sample][there], None if profile is None else profile.of(sample)
-        return Fit(*loads, self.base_wrench[sample], zeta, tip, interval, along)
+        return FittedRod(*loads, self.base_wrench[sample], zeta, tip, interval, along)
 
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
         """With the samples of `index` replaced by those of another attempt where that is better; every attempt is counted.
 
-        Better: accepted where this one is not, else of lower cost.
+        Better: accepted where this one is not, else of lower cost. What is said of the start that was given stays.
         """
         was, lower = self.accepted[index], other.cost < self.cost[index].nan_to_num(torch.inf)
         better = (other.accepted & ~was) | ((other.accepted == was) & lower)
-        changed = {}
+        merged = self.merged(other, index, better)
+        return replace(
+            merged, guess=self.guess, fate=self.fate, restarts=merged.restarts.index_add(0, index, torch.ones_like(index))
+        )
+
+    def merged(self, other: "Estimate", index: Int[Tensor, " b"], better: Bool[Tensor, " b"]) -> "Estimate":
+        """With the samples of `index` that are better in `other`, which holds only those samples; every evaluation is counted.
+
+        Where one of the two has more loads or unknowns, entries that the other does not have are NaN.
+        """
+        changed: dict[str, Tensor | None] = {}
         for f in fields(Estimate):
-            value = getattr(self, f.name)
-            if value is not None:
-                changed[f.name] = value.clone()
-                changed[f.name][index[better]] = getattr(other, f.name)[better]
-        changed["learned"] = self.learned
+            mine, theirs = getattr(self, f.name), getattr(other, f.name)
+            if mine is None and theirs is None:
+                changed[f.name] = None
+                continue
+            mine, theirs = _alike(mine, theirs, (len(self.status), len(index)))
+            mine[index[better]] = theirs[better]
+            changed[f.name] = mine
         changed["iterations"] = self.iterations.index_add(0, index, other.iterations)
-        changed["restarts"] = self.restarts.index_add(0, index, 1 + other.restarts)
-        return replace(self, **changed)
+        changed["restarts"] = self.restarts.index_add(0, index, other.restarts)
+        return Estimate(**changed)  # pyright: ignore[reportArgumentType]
 
     @staticmethod
     def cat(parts: list["Estimate"]) -> "Estimate":
@@ -174,6 +269,22 @@ class Estimate:
         return Estimate(**{f.name: joined([getattr(p, f.name) for p in parts]) for f in fields(Estimate)})  # pyright: ignore[reportArgumentType]
 
 
+def _alike(mine: Tensor | None, theirs: Tensor | None, counts: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Copies of the same trailing shape, filled up with NaN; of one that is None, nothing but NaN."""
+    present = [v for v in (mine, theirs) if v is not None]
+    wide = tuple(max(sizes) for sizes in zip(*(v.shape[1:] for v in present), strict=True))
+
+    def padded(v: Tensor | None, count: int) -> Tensor:
+        if v is not None and v.shape[1:] == wide:
+            return v.clone()
+        full = torch.full((count, *wide), torch.nan, dtype=present[0].dtype)
+        if v is not None:
+            full[(slice(None), *(slice(0, n) for n in v.shape[1:]))] = v
+        return full
+
+    return padded(mine, counts[0]), padded(theirs, counts[1])
+
+
 def _interval(value: Float[Tensor, "B K"], std: Float[Tensor, "B K"]) -> Float[Tensor, "B K 2"]:
     """95 %: symmetric in the logarithm where that is well known (to a factor of about e), else in the value, and not below 0."""
     relative = std / value
@@ -183,12 +294,11 @@ def _interval(value: Float[Tensor, "B K"], std: Float[Tensor, "B K"]) -> Float[T
     return torch.where((relative < 0.5).unsqueeze(-1), by_factor, by_difference)
 
 
-def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B K 4 4"]:
-    """Covariance of [F_x, F_y, location, width] per load, carried over from x by the derivative of `describe`."""
-    c, n = model.coordinates, model.coordinates.size
-    if isinstance(c, GaussianCoordinates) and n:  # a fifth of the time of a single frame
-        slope = c.report_slope(x[:, :n])
-        own = covariance[:, :n, :n].unflatten(2, (c.count, -1)).unflatten(1, (c.count, -1)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
+def load_covariance(c: LoadFamily, gamma: Float[Tensor, "B g"], C: Float[Tensor, "B g g"]) -> Float[Tensor, "B K 4 4"]:
+    """Covariance of [F_x, F_y, location, width] per load, carried over from that of gamma by the derivative of `describe`."""
+    if isinstance(c, GaussianCoordinates) and c.size:  # a fifth of the time of a single frame
+        slope = c.report_slope(gamma)
+        own = C.unflatten(2, (c.count, -1)).unflatten(1, (c.count, -1)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
         if c.per_load == 3:
             own = own[..., [0, 1, 2, 2], :][..., [0, 1, 2, 2]]  # any entry in the location's place
         return own * (slope.unsqueeze(-1) * slope.unsqueeze(-2))
@@ -197,30 +307,9 @@ def load_covariance(model: Model, x: Float[Tensor, "B n"], covariance: Float[Ten
         report = c.describe(gamma)
         return torch.cat([report.force, report.location.unsqueeze(-1), report.width.unsqueeze(-1)], -1).flatten(-2)
 
-    _, J = pointwise_jacobian(described, x[:, :n])
+    _, J = pointwise_jacobian(described, gamma)
     J = J.unflatten(1, (-1, 4))
-    return J @ covariance[:, None, :n, :n] @ J.transpose(-1, -2)
-
-
-def tip_covariance(model: Model, covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B 6 6"]:
-    """Covariance of the unknown wrench at the tip [N, N m]; zero in the entries that are not unknown."""
-    first, last = model.coordinates.size, model.load_size
-    scale = model.alpha_scale(covariance)
-    block = covariance[:, first:last, first:last]
-    rest = 6 - (last - first)
-    return torch.nn.functional.pad(block, (0, rest, 0, rest)) * scale * scale.unsqueeze(-1)
-
-
-def _tensions(
-    prepared: Prepared, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]
-) -> tuple[Float[Tensor, "B T"], Float[Tensor, "B T"]] | None:
-    """The tensions (N) after the fit and their standard deviations, where they are unknown."""
-    model = prepared.model
-    tension = model.tension(x, prepared.markers.tension)
-    if model.tension_std is None or tension is None:
-        return None
-    variance = covariance.diagonal(dim1=-2, dim2=-1)[:, model.load_size : model.load_size + model.tension_size]
-    return tension, model.tension_std * variance.clamp(min=0).sqrt()
+    return J @ C.unsqueeze(1) @ J.transpose(-1, -2)
 
 
 def _only(mask: Bool[Tensor, "..."]) -> Callable[[Tensor], Tensor]:
@@ -231,42 +320,47 @@ def _only(mask: Bool[Tensor, "..."]) -> Callable[[Tensor], Tensor]:
 
 
 def make_estimate(
-    prepared: Prepared,
+    evaluate: Evaluator,
     x: Float[Tensor, "B n"],
     evaluated: Float[Tensor, "B n"],
     sums: Sums,
     status: Int[Tensor, " B"],
     iterations: Int[Tensor, " B"],
-    warm_started: Bool[Tensor, " B"],
+    origin: Int[Tensor, " B"],
 ) -> Estimate:
     """Assemble the result from x and the sums where the model was last evaluated; an invalid sample holds NaN throughout."""
-    model, markers = prepared.model, prepared.markers
-    covariance, cost = prepared.posterior(sums, evaluated)
+    problem = evaluate.problem
+    state, family = problem.state, problem.unknowns.loads
+    covariance, cost = evaluate.posterior(sums, evaluated)
     valid = (status != int(Status.INVALID)) & torch.isfinite(cost)
     status = torch.where(valid, status, int(Status.INVALID))
 
     converged = status == int(Status.CONVERGED)
     kept, settled = _only(valid), _only(converged)  # elsewhere a spread would look like knowledge
-    gamma, zeta, alpha = model.split(x)
-    report = model.coordinates.describe(gamma)
-    free = _tensions(prepared, x, covariance)
-    outlier, chi2, dof, explained = verdict(prepared, sums, cost)
+    gamma = x[:, state.loads.at]
+    report = family.describe(gamma)
+    outlier, chi2, dof, explained = verdict(evaluate, sums, cost)
+    rows = sums.r[:, :-TIP_ROWS]
+    tip, free = state.tip.size, state.tension.size
+    variance = state.tension.covariance(covariance).diagonal(dim1=-2, dim2=-1)
+    pad = torch.nn.functional.pad
     return Estimate(
         x=kept(x),
         covariance=settled(covariance),
         force=kept(report.force),
         location=kept(report.location),
         width=kept(report.width),
-        load_covariance=settled(load_covariance(model, x, covariance)),
+        load_covariance=settled(load_covariance(family, gamma, covariance[:, state.loads.at, state.loads.at])),
         net_force=kept(report.net_force),
-        tip=None if model.tip == "none" else kept(model.tip_wrench(x)),
-        tip_covariance=None if model.tip == "none" else settled(tip_covariance(model, covariance)),
-        base_wrench=kept(alpha),
-        registration=None if zeta is None else kept(zeta),
+        tip=kept(state.tip_wrench(x)) if tip else None,
+        tip_covariance=settled(pad(state.tip.covariance(covariance), (0, 6 - tip, 0, 6 - tip))) if tip else None,
+        base_wrench=kept(state.base.of(x)),
+        registration=kept(state.registration.of(x)) if state.registration.size else None,
         centre_line=kept(sums.line),
-        residual=_only(markers.present)(kept(sums.r[:, :-6].unflatten(-1, (-1, 3)))),
-        tension=None if free is None else kept(free[0]),
-        tension_std=None if free is None else settled(free[1]),
+        residual=_only(torch.isfinite(problem.distances(problem.reading)).all(-1))(kept(problem.distances(rows))),
+        row_residual=kept(rows),
+        tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
+        tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,
         outlier=outlier,
         cost=kept(cost),
         chi2=kept(chi2),
@@ -275,6 +369,7 @@ def make_estimate(
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,
-        warm_started=warm_started,
-        learned=torch.full_like(iterations, int(Learned.NONE)),
+        origin=origin,
+        guess=origin,
+        fate=torch.zeros_like(origin),
     )

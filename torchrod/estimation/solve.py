@@ -1,30 +1,40 @@
-"""Estimate loads from markers: iterate the filter on a batch until every sample has settled."""
+"""Estimate: iterate the filter on a batch until every sample has settled, and what wraps it where one run is not enough.
+
+A solver maps a problem and a start to an estimate. `Filter` is the plain one: init, step, terminate. The strategies each wrap one:
+`Robust` goes on with Student's t, `Restarts` tries other magnitudes where a fit is not accepted, `Challenged` drops a start that is
+no nearer to the data than a cold one, and follows one that fails by a cold start.
+"""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..kernel import Sums, iterate_all
+from .. import kernel
 from ..model.load_families import PaperCoordinates
-from ..model.measurement import Markers, Model
-from ..model.validate import check, usable
+from ..model.problem import Problem
 from ..util.precision import DTYPE
-from ..util.status import Learned, Status
+from ..util.status import Status
 from ..util.threads import one_thread
 from . import filter as ekf
-from .evaluator import Prepared, served
+from .evaluator import Evaluator, Run, evaluator, kernel_serves
 from .result import Estimate, make_estimate
-from .starts import Start, StartRule, better_start, cold_start, in_equilibrium
+from .starts import Fate, Origin, Start, StartRule, challenged_by_cold, cold_start, in_equilibrium
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
 FEW = 1024  # samples for which torch's own share is done sooner on one thread
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
+Progress = Callable[[int], object]
+
+
+def silent(_: int) -> None:
+    """No progress bar."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +42,13 @@ class Settings:
     """How the filter is run. Sigma0, Q: the variances (per entry of x) it starts from and adds at every iteration (4).
 
     step_limit: the largest change of any entry in one iteration. adaptive: residual-adaptive noise.
-    coarse: begin with measurement.COARSE_STEPS steps along the rod and end, where the fit is near, with the model's own.
+    coarse: begin with model.problem.COARSE_STEPS steps along the rod and end, where the fit is near, with the problem's own.
     robust: degrees of freedom of Student's t, by which the fit goes on from where the normal distribution's has ended; markers far
     off then weigh little (estimation.filter (6)), and those beyond the 99.9 % point are called outliers. inf: the normal one alone.
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
+    Errors: ValueError for numbers that no filter can be run with.
     """
 
     Sigma0: float | Float[Tensor, " n"] = 1.0
@@ -49,21 +60,45 @@ class Settings:
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
     robust: float = math.inf
 
+    def __post_init__(self):
+        for name, least in (("Sigma0", "above"), ("Q", "at least")):
+            value = getattr(self, name)
+            values = value.flatten().tolist() if isinstance(value, Tensor) else [value]
+            if not all((v > 0 or (v == 0 and name == "Q")) and v < math.inf for v in values):
+                raise ValueError(f"Settings.{name} must be finite and {least} 0")
+        if not self.step_limit > 0:
+            raise ValueError(f"Settings.step_limit is {self.step_limit}; it must be positive")
+        if not self.robust > 0:
+            raise ValueError(f"Settings.robust is {self.robust}; it must be positive (degrees of freedom), or inf")
+        if self.max_iterations < 1:
+            raise ValueError(f"Settings.max_iterations is {self.max_iterations}; it must be at least 1")
+        if not all(0 < factor < math.inf for factor in self.restarts):
+            raise ValueError(f"Settings.restarts is {self.restarts}; every factor must be positive and finite")
+
     def initial_covariance(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "n n"]:
         """Sigma0 as a matrix."""
         return torch.diag(self.Sigma0 * x.new_ones(x.shape[-1]))
 
 
-def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
+def paper_settings(problem: Problem, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
     """The paper's plain recursion: no step limit, no adaptive noise.
 
     Q and Sigma0 multiply the squared sizes of [a_x, a_y, eta, c] and of alpha and zeta. The paper does not print its own; these
     sizes did best of those tried on Study 1 (docs/model.md).
     """
-    assert isinstance(model.coordinates, PaperCoordinates)
-    size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
-    size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
-    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, False, 500, ())
+    loads = problem.unknowns.loads
+    assert isinstance(loads, PaperCoordinates)
+    size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(loads.count)
+    size = torch.cat([size, torch.ones(problem.size - len(size), dtype=DTYPE)])
+    return Settings(
+        Sigma0=Sigma0 * size**2,
+        Q=Q * size**2,
+        step_limit=torch.inf,
+        adaptive=False,
+        coarse=False,
+        max_iterations=500,
+        restarts=(),
+    )
 
 
 @dataclass(frozen=True)
@@ -78,197 +113,204 @@ class Linearized:
     decrement: Float[Tensor, " B"]
 
 
-def linearize(model: Model, x: Float[Tensor, "B n"], markers: Markers, w: Float[Tensor, "B z"]) -> Linearized:
-    """r = z - h(x) (zero where a marker is missing), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3)."""
-    h, H = model.linearized(x, markers)
-    r = Prepared(model, markers, w).residual(h)
-    A, g = ekf.information(H, r, w, x, *model.prior())
-    mean, precision = model.prior()
-    cost = (w * r * r).sum(-1) + (precision * (mean - x) ** 2).sum(-1)
+def linearize(problem: Problem, x: Float[Tensor, "B n"], w: Float[Tensor, "B z"] | None = None) -> Linearized:
+    """r = z - h(x) (zero where nothing was read), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3).
+
+    w: other weights than the problem's.
+    """
+    w = problem.weights if w is None else w
+    h, H = problem.linearized(x)
+    r = torch.where(w > 0, problem.reading - h, 0.0)
+    A, g = ekf.information(H, r, w, x, problem.mean, problem.precision)
+    cost = (w * r * r).sum(-1) + (problem.precision * (problem.mean - x) ** 2).sum(-1)
     return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
 
 
-def _silent(_: int) -> None:
-    """No progress bar."""
+class Solver(Protocol):
+    """What turns a problem and a start into an estimate."""
+
+    def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
+        """The fit of every sample. progress: called as samples finish, with their number."""
+        ...
 
 
 @dataclass(frozen=True)
-class _Course:
-    """Iterations on the samples `live`, at most `most` each: those far from the data by the coarse model, the rest by the fine one.
+class Filter:
+    """The recursion (4) on a batch: samples far from the data by a coarse model of the rod, the rest by the problem's own."""
 
-    state: the iterate, Sigma0, Q and the sums, which change in place. rough, fine: a model made ready, and when it has arrived.
-    """
+    settings: Settings
+    nu: float = math.inf
 
-    state: tuple[ekf.Iterate, Float[Tensor, "B n n"], Float[Tensor, " n"], Sums]
-    rough: tuple[Prepared, ekf.Limits]
-    fine: tuple[Prepared, ekf.Limits]
-    live: Int[Tensor, " b"]
-    near: Bool[Tensor, " B"]
-    most: int
+    def init(self, problem: Problem, start: Start) -> Run:
+        """The state before the first iteration."""
+        settings, x = self.settings, start.x.clone()
+        Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
+        Sigma0, Q = Sigma0.contiguous(), settings.Q * x.new_ones(problem.size)
+        cap = x.new_full((len(x),), torch.inf if settings.adaptive else 0.0)
+        at = ekf.Iterate(x, Sigma0.clone(), x.clone(), cap, torch.zeros(len(x), dtype=torch.bool))
+        sums = kernel.Sums.room(len(x), problem.size, problem.weights.shape[-1], len(problem.s))
+        near = torch.full((len(x),), not settings.coarse or problem.coarse is problem)
+        return Run(at, Sigma0, Q, sums, near)
 
-    def at_once(self) -> tuple[Bool[Tensor, " B"], Int[Tensor, " B"]]:
-        """Which samples have converged, and their iterations: step_by_step in one call of the kernel."""
-        at, Sigma0, Q, sums = self.state
-        calls = [(p.compiled_iteration(at, Sigma0, Q, limits, sums), p.tables(at.x)) for p, limits in (self.rough, self.fine)]
-        return iterate_all(calls[0], calls[1], self.live, self.near, self.most)
+    def step(
+        self, models: tuple[Evaluator, Evaluator], run: Run, live: Int[Tensor, " b"]
+    ) -> tuple[Bool[Tensor, " B"], Int[Tensor, " B"]]:
+        """Iterate the samples `live`, in place, until they are done: which have converged, and how many iterations each has had.
 
-    def step_by_step(self) -> tuple[Bool[Tensor, " B"], Int[Tensor, " B"]]:
-        """The same: samples leave the batch when they have converged; a failed one never touches its neighbours."""
-        at, Sigma0, Q, sums = self.state
-        rough_once, once = (p.iteration(at, Sigma0, Q, limits, sums) for p, limits in (self.rough, self.fine))
-        near, live, B = self.near, self.live, len(self.near)
+        Samples leave the batch when they have converged; a failed one never touches its neighbours.
+        """
+        rough, fine = models
+        limits = ekf.Limits(step=self.settings.step_limit)
+        both = limits._replace(decrement=NEAR), limits
+        most = self.settings.max_iterations
+        at_once = rough.iterate_all(fine, run, both, live, most)
+        if at_once is not None:
+            return at_once
+        rough_once, once = (model.iteration(run, own) for model, own in zip(models, both, strict=True))
+        near, done, B = run.near, run.at.done, len(run.near)
         converged, iterations = torch.zeros(B, dtype=torch.bool), torch.zeros(B, dtype=torch.int64)
-        for iteration in range(self.most):
+        for iteration in range(most):
             if not len(live):
                 break
             iterations[live] += 1
             far, close = live[~near[live]], live[near[live]]
             if len(far):
                 rough_once(far)
-                near[far] = at.done[far] | (2 * iteration >= self.most)
+                near[far] = done[far] | (2 * iteration >= most)
             if len(close):
                 once(close)
-                done = at.done[close]
-                converged[close[done]] = True
-                live = torch.cat([far, close[~done]]).sort().values
+                settled = done[close]
+                converged[close[settled]] = True
+                live = torch.cat([far, close[~settled]]).sort().values
         return converged, iterations
 
-
-def _filter(
-    model: Model, markers: Markers, noise: float, settings: Settings, start: Start, progress: Callable[[int], object]
-) -> Estimate:
-    """Iterate one chunk."""
-    prepared = Prepared(model, markers, model.weights(markers, noise), settings.robust)
-    x = start.x.clone()
-    Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
-    Sigma0, Q = Sigma0.contiguous(), settings.Q * x.new_ones(model.size)
-    cap = x.new_full((len(x),), torch.inf if settings.adaptive else 0.0)
-    at = ekf.Iterate(x, Sigma0.clone(), x.clone(), cap, torch.zeros(len(x), dtype=torch.bool))
-    ok = usable(model, markers)
-    status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
-    live = ok.nonzero().squeeze(-1)
-    sums = Sums.room(len(x), model.size, len(markers.s))
-    limits = ekf.Limits(step=settings.step_limit)
-    rough = replace(prepared, model=model.coarse), limits._replace(decrement=NEAR)
-    near = torch.full((len(x),), not settings.coarse or model.coarse is model)
-    course = _Course((at, Sigma0, Q, sums), rough, (prepared, limits), live, near, settings.max_iterations)
-    converged, iterations = course.at_once() if prepared.at_once else course.step_by_step()
-    status[converged] = int(Status.CONVERGED)
-    progress(len(x))
-    rest = (status != int(Status.CONVERGED)).nonzero().squeeze(-1)
-    if len(rest):
-        sums.put(rest, prepared.take(rest).sums(at.x[rest]))
-    evaluated = torch.where(converged.unsqueeze(-1), at.before, at.x)
-    return make_estimate(prepared, at.x, evaluated, sums, status, iterations, start.warm)
+    def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
+        """See Solver."""
+        fine = evaluator(problem, self.nu)
+        rough = fine if problem.coarse is problem else evaluator(problem.coarse, self.nu)
+        run = self.init(problem, start)
+        ok = problem.usable
+        status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
+        converged, iterations = self.step((rough, fine), run, ok.nonzero().squeeze(-1))
+        status[converged] = int(Status.CONVERGED)
+        progress(len(status))
+        rest = (~converged).nonzero().squeeze(-1)
+        if len(rest):
+            run.sums.put(rest, fine.take(rest).sums(run.at.x[rest]))
+        evaluated = torch.where(converged.unsqueeze(-1), run.at.before, run.at.x)
+        return make_estimate(fine, run.at.x, evaluated, run.sums, status, iterations, start.origin)
 
 
 @dataclass(frozen=True)
-class _Chunk:
-    """Some samples, and how they are to be fitted."""
+class Robust:
+    """On with Student's t of nu degrees of freedom from where the normal distribution's fit has ended.
 
-    model: Model
-    markers: Markers
-    noise: float
-    settings: Settings
+    Markers far off can lead that fit so far astray that Student's t ends in another minimum (5 % of two contacts): where there are
+    outliers, once more from a fit without them, and the one of less cost is kept.
+    """
 
-    def take(self, index: Int[Tensor, " b"]) -> "_Chunk":
-        return replace(self, markers=self.markers.take(index))
+    normal: Filter
+    nu: float
 
-    def filtered(self, start: Start, progress: Callable[[int], object] = _silent) -> Estimate:
-        """The filter; on with Student's t from where the normal distribution's fit has ended, if so wished.
-
-        Markers far off can lead that fit so far astray that Student's t ends in another minimum (5 % of two contacts): where there
-        are outliers, once more from a fit without them, and the one of less cost is kept.
-        """
-        normal = replace(self.settings, robust=math.inf)
-        fit = _filter(self.model, self.markers, self.noise, normal, start, progress)
-        if math.isinf(self.settings.robust):
-            return fit
-        onward = self.onward(fit)
+    def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
+        """See Solver."""
+        onward = self._onward(problem, self.normal(problem, start, progress))
         index = onward.outlier.any(-1).nonzero().squeeze(-1)
         if not len(index):
             return onward
-        part = self.take(index)
-        kept = part.markers.positions.masked_fill(onward.outlier[index].unsqueeze(-1), torch.nan)
-        trimmed = replace(part, markers=replace(part.markers, positions=kept), settings=normal)
-        return onward.improved_by(part.onward(trimmed.cold()), index)
+        part = problem.take(index)
+        trimmed = self.normal(part.without(onward.outlier[index]), cold_start(part))
+        return onward.improved_by(self._onward(part, trimmed), index)
 
-    def onward(self, fit: Estimate) -> Estimate:
-        """Student's t from where a fit has ended."""
-        again = Start(fit.x.nan_to_num(0.0), None, fit.warm_started)
-        onward = _filter(self.model, self.markers, self.noise, self.settings, again, _silent)
+    def _onward(self, problem: Problem, fit: Estimate) -> Estimate:
+        again = Start.at(fit.x.nan_to_num(0.0), fit.origin)
+        onward = replace(self.normal, nu=self.nu)(problem, again)
         return replace(onward, iterations=fit.iterations + onward.iterations)
 
-    def cold(self) -> Estimate:
-        """From no load."""
-        return self.filtered(cold_start(self.model, self.markers, self.noise))
 
-    def restarted(self, fit: Estimate, wanted: Bool[Tensor, " B"] | bool = True) -> Estimate:
-        """The fit, and where it is not accepted (and a restart wanted) again from other magnitudes."""
-        hasty = replace(self.settings, max_iterations=min(self.settings.max_iterations, RESTART_ITERATIONS))
-        coordinates = self.model.coordinates
-        for factor in self.settings.restarts if coordinates.size else ():
+@dataclass(frozen=True)
+class Restarts:
+    """The solver's fit, and where it is not accepted the solver again, `hasty`, from its loads times each of the factors."""
+
+    solver: Solver
+    hasty: Solver
+    factors: tuple[float, ...]
+
+    def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
+        """See Solver."""
+        return self.improve(problem, self.solver(problem, start, progress))
+
+    def improve(self, problem: Problem, fit: Estimate, wanted: Bool[Tensor, " B"] | bool = True) -> Estimate:
+        """A fit that is there already, restarted where it is not accepted and a restart wanted."""
+        loads, at = problem.unknowns.loads, problem.state.loads.at
+        for factor in self.factors if loads.size else ():
             index = (~fit.accepted & torch.isfinite(fit.x).all(-1) & wanted).nonzero().squeeze(-1)
             if not len(index):
                 break
-            part = replace(self.take(index), settings=hasty)
-            gamma = coordinates.rescaled(fit.x[index, : coordinates.size], factor)
-            x = in_equilibrium(self.model, gamma, part.markers)
-            fit = fit.improved_by(part.filtered(Start.known(x)), index)
+            part = problem.take(index)
+            x = in_equilibrium(part, loads.rescaled(fit.x[index][:, at], factor))
+            fit = fit.improved_by(self.hasty(part, Start.at(x, Origin.OTHER_FIT)), index)
         return fit
 
 
-def _fitted(chunk: _Chunk, start: Start, progress: Callable[[int], object]) -> Estimate:
-    """From a guess that costs less than a cold start; where no accepted fit comes of it, all that would come of a cold start."""
-    model, markers, settings = chunk.model, chunk.markers, chunk.settings
-    chosen, dropped = better_start(model, markers, chunk.noise, start, settings.initial_covariance(start.x))
-    fit = chunk.filtered(chosen, progress)
-    failed = chosen.warm & ~fit.accepted & usable(model, markers)
-    learned = torch.where(start.warm, int(Learned.USED), int(Learned.NONE))
-    learned[dropped], learned[failed] = int(Learned.DROPPED), int(Learned.RETRIED)
-    fit = replace(fit, learned=learned)
-    index = failed.nonzero().squeeze(-1)
-    if len(index):
-        again = chunk.take(index)
-        fit = fit.improved_by(again.restarted(again.cold()), index)
-    return chunk.restarted(fit, ~failed)
+@dataclass(frozen=True)
+class Challenged:
+    """From a start that costs less than a cold one; where no accepted fit comes of it, all that would come of a cold start."""
+
+    solver: Restarts
+    Sigma0: Float[Tensor, "n n"]
+
+    def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
+        """See Solver."""
+        chosen, dropped = challenged_by_cold(problem, start, self.Sigma0)
+        fit = self.solver.solver(problem, chosen, progress)
+        failed = chosen.challenged & ~fit.accepted & problem.usable
+        fate = torch.zeros_like(start.origin)
+        fate[dropped], fate[failed] = int(Fate.DROPPED), int(Fate.RETRIED)
+        fit = replace(fit, guess=start.origin, fate=fate)
+        index = failed.nonzero().squeeze(-1)
+        if len(index):
+            part = problem.take(index)
+            fit = fit.improved_by(self.solver(part, cold_start(part)), index)
+        return self.solver.improve(problem, fit, ~failed)
 
 
-def estimate(
-    model: Model,
-    markers: Markers,
-    noise: float,
-    settings: Settings | None = None,
-    start: StartRule | Start = cold_start,
-    progress: Callable[[int], object] = _silent,
+def solver_of(problem: Problem, settings: Settings) -> Solver:
+    """The solver that the settings describe: Challenged(Restarts(Robust(Filter)))."""
+
+    def base(settings: Settings) -> Solver:
+        plain = Filter(settings)
+        return plain if math.isinf(settings.robust) else Robust(plain, settings.robust)
+
+    hasty = replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS))
+    restarts = Restarts(base(settings), base(hasty), settings.restarts)
+    return Challenged(restarts, settings.initial_covariance(problem.mean))
+
+
+def estimate_each(
+    problem: Problem, settings: Settings | None = None, start: StartRule | Start = cold_start, progress: Progress = silent
 ) -> Estimate:
-    """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
-
-    noise: standard deviation of a marker coordinate (m), where markers.sigma does not have one for each sample.
-    start: where to start, or a rule that says so from (model, markers, noise) of some of the samples; a guess that is no nearer to
-    the data than a cold start is dropped, and one that leads to no accepted fit is followed by a cold start.
-    progress: called as samples finish, with their number. A sample's answer does not depend on its batch.
-    Errors: ValueError for markers or a start that do not fit the robot; a sample that cannot be estimated has a status for it.
-    Source: the paper, section II; docs/model.md.
-    """
-    check(model, markers, noise)
-    if model.robot.gravity.ndim != 1:
+    """Fit every sample by itself, whatever the scope of its unknowns: see torchrod.estimate, which adds what samples share."""
+    problem.check()
+    if problem.robot.gravity.ndim != 1:
         raise ValueError("an estimate takes one gravity (3,) for all samples; estimate those of each gravity by themselves")
-    parts, compiled = [], served(model, markers.positions)
+    parts, compiled, B = [], kernel_serves(problem), problem.batch
     size = CHUNK if compiled else CHUNK_TORCH
+    solve = solver_of(problem, settings or Settings())
     # What is kept from call to call, and the answer, must serve outside of inference mode, too.
-    with torch.inference_mode(False), one_thread(compiled and len(markers.positions) <= FEW):
-        for first in range(0, len(markers.positions), size):
-            index = torch.arange(first, min(first + size, len(markers.positions)))
-            chunk = _Chunk(model, markers.take(index), noise, settings or Settings())
-            parts.append(_fitted(chunk, _begin(start, chunk, index, len(markers.positions)), progress))
+    with torch.inference_mode(False), one_thread(compiled and B <= FEW):
+        for first in range(0, B, size):
+            index = torch.arange(first, min(first + size, B))
+            # A problem of its own for each call: what it works out from tensors must not outlive a change of them.
+            chunk = replace(problem) if len(index) == B else problem.take(index)
+            parts.append(solve(chunk, _begin(start, chunk, index, B), progress))
     return Estimate.cat(parts)
 
 
-def _begin(start: StartRule | Start, chunk: _Chunk, index: Int[Tensor, " b"], count: int) -> Start:
+def _begin(start: StartRule | Start, chunk: Problem, index: Int[Tensor, " b"], count: int) -> Start:
     """Where the samples `index` of `count`, which are the chunk, start."""
-    begin = start if isinstance(start, Start) else start(chunk.model, chunk.markers, chunk.noise)
-    wanted = (count if begin is start else len(index), chunk.model.size)
+    begin = start if isinstance(start, Start) else start(chunk)
+    wanted = (count if begin is start else len(index), chunk.size)
     if tuple(begin.x.shape) != wanted:
-        raise ValueError(f"start.x has shape {tuple(begin.x.shape)}; these markers and this model need {wanted}")
+        raise ValueError(f"start.x has shape {tuple(begin.x.shape)}; these measurements and unknowns need {wanted}")
     return begin.take(index) if begin is start else begin

@@ -1,101 +1,128 @@
-"""Where the filter starts: from no load, or from a guess that must first show that it is nearer to the data than that."""
+"""Where the filter starts, where that came from, and what it must beat."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..model.measurement import Markers, Model
+from ..model.problem import Problem
 from ..util.precision import Float64
 from .at_rest import at_rest, without_load
-from .evaluator import Prepared
+from .evaluator import evaluator
+
+
+class Origin(IntEnum):
+    """Where a start comes from; `.label` names it."""
+
+    COLD = 0
+    LEARNED = 1
+    PREVIOUS = 2
+    SCORE_TEST = 3
+    OTHER_FIT = 4
+
+    @property
+    def label(self) -> str:
+        """For messages."""
+        return _LABELS[self]
+
+
+_LABELS = {
+    Origin.COLD: "cold start",
+    Origin.LEARNED: "learned start",
+    Origin.PREVIOUS: "start from the previous frame",
+    Origin.SCORE_TEST: "start from the score test",
+    Origin.OTHER_FIT: "start from another fit",
+}
+
+
+class Fate(IntEnum):
+    """What became of the start that a sample was given."""
+
+    USED = 0
+    DROPPED = 1
+    RETRIED = 2
 
 
 @dataclass(frozen=True)
 class Start(Float64):
-    """Where B samples start: x (B, n) in the model's coordinates.
+    """Where B samples start: x (B, n), in the units of the problem's state.
 
-    Sigma0: the covariance (B, n, n) to start with; None leaves it to the settings. warm: (B,), which samples start from a guess;
-    the others start cold, from no load. cold: x of a cold start, and costs (B, 2) of x and of that by the model, if the rule has
-    them at hand.
+    origin: (B,) Origin codes. challenged: (B,), which samples must show that their x is nearer to the data than a cold start, and
+    are followed by a cold start where no accepted fit comes of it; the others start from x whatever it costs. Sigma0: the
+    covariance (B, n, n) to start with; None leaves it to the settings. cold: x of a cold start, and costs (B, 2) of x and of that
+    by the model, if the rule has them at hand.
     """
 
     x: Float[Tensor, "B n"]
-    Sigma0: Float[Tensor, "B n n"] | None
-    warm: Bool[Tensor, " B"]
+    origin: Int[Tensor, " B"]
+    challenged: Bool[Tensor, " B"]
+    Sigma0: Float[Tensor, "B n n"] | None = None
     cold: Float[Tensor, "B n"] | None = None
     costs: Float[Tensor, "B 2"] | None = None
 
+    def __post_init__(self):
+        origin = self.origin
+        super().__post_init__()
+        object.__setattr__(self, "origin", origin)  # codes stay integers
+
     @classmethod
-    def known(cls, x: Float[Tensor, "B n"]) -> "Start":
-        """To be begun from whatever a cold start would cost."""
-        return cls(x, None, torch.zeros(len(x), dtype=torch.bool))
+    def at(cls, x: Float[Tensor, "B n"], origin: Origin | Int[Tensor, " B"], challenged: bool = False) -> "Start":
+        """All samples alike."""
+        codes = origin if isinstance(origin, Tensor) else torch.full((len(x),), int(origin))
+        return cls(x, codes, torch.full((len(x),), challenged))
 
     def take(self, index: Int[Tensor, " b"]) -> "Start":
         """The samples of an index."""
         Sigma0, cold, costs = (None if part is None else part[index] for part in (self.Sigma0, self.cold, self.costs))
-        return Start(self.x[index], Sigma0, self.warm[index], cold, costs)
+        return Start(self.x[index], self.origin[index], self.challenged[index], Sigma0, cold, costs)
 
 
-StartRule = Callable[[Model, Markers, float], Start]
+StartRule = Callable[[Problem], Start]
 
 
 def in_equilibrium(
-    model: Model, gamma: Float[Tensor, "B g"], markers: Markers, q_tip: Float[Tensor, "B 4"] | None = None
+    problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None = None
 ) -> Float[Tensor, "B n"]:
     """x at the loads gamma, with the base wrench of the robot in equilibrium under them; of zero where there is none to be found.
 
     q_tip: the orientation of the tip near which to look, where it is known: sooner found.
     """
-    return model.join(gamma, at_rest(model, markers, gamma, q_tip).wrench.nan_to_num(0.0))
+    return problem.state.join(gamma, at_rest(problem, gamma, q_tip).wrench.nan_to_num(0.0))
 
 
-def costs_in_equilibrium(
-    model: Model, markers: Markers, noise: float, x: Float[Tensor, "B k n"], p: Float[Tensor, "B k P 3"]
-) -> Float[Tensor, "B k"]:
-    """The cost of (3) with the prior's at k states x, whose shapes p (m) in equilibrium are known: there is no tip residual."""
-    mean, precision = model.prior()
-    square = (markers.positions.unsqueeze(1) - p).square().sum(-1)
-    seen = torch.where(markers.present.unsqueeze(1), square, 0.0).sum(-1)
-    variance = noise**2 if markers.sigma is None else markers.sigma.unsqueeze(-1) ** 2
-    return seen / variance + (precision * (mean - x) ** 2).sum(-1)
+def cold_start(problem: Problem) -> Start:
+    """No load where the load family says so, and the base wrench of the rod in equilibrium without it."""
+    return Start.at(cold_from(problem, without_load(problem).wrench.nan_to_num(0.0)), Origin.COLD)
 
 
-def cold_start(model: Model, markers: Markers, noise: float) -> Start:
-    """No load where the coordinates say so, and the base wrench of the rod in equilibrium without it."""
-    x = cold_from(model, without_load(model, markers).wrench.nan_to_num(0.0))
-    return Start(x, None, torch.zeros(len(x), dtype=torch.bool))
-
-
-def cold_from(model: Model, alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:
+def cold_from(problem: Problem, alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:
     """x of a cold start, from the base wrench (N, N m) of the robot without load."""
-    return model.join(model.coordinates.start().expand(len(alpha), -1), alpha)
+    return problem.state.join(problem.unknowns.loads.start().expand(len(alpha), -1), alpha)
 
 
-def better_start(
-    model: Model, markers: Markers, noise: float, start: Start, Sigma0: Float[Tensor, "n n"]
-) -> tuple[Start, Bool[Tensor, " B"]]:
-    """Per warm sample, the cheaper of its guess and a cold start, and which guesses were dropped, (B,).
+def challenged_by_cold(problem: Problem, start: Start, Sigma0: Float[Tensor, "n n"]) -> tuple[Start, Bool[Tensor, " B"]]:
+    """Per challenged sample, the cheaper of its start and a cold start, and which starts were dropped, (B,).
 
     Sigma0 is what a cold start goes with. Where the rule does not have their costs, each takes one evaluation of h without its
-    Jacobian, on coarse steps. A guess that is not finite, or that bends the rod out of all bounds, is dropped with the rest.
+    Jacobian, on coarse steps. A start that is not finite, or that bends the rod out of all bounds, is dropped with the rest.
     """
-    index = start.warm.nonzero().squeeze(-1)
+    index = start.challenged.nonzero().squeeze(-1)
     if not len(index):
-        return start, start.warm
-    cold = cold_start(model, markers.take(index), noise).x if start.cold is None else start.cold[index]
+        return start, start.challenged
+    part = problem.take(index)
+    cold = cold_start(part).x if start.cold is None else start.cold[index]
     if start.costs is None:
-        part = markers if len(index) == len(start.warm) else markers.take(index)
-        prepared = Prepared(model.coarse, part, model.weights(part, noise))
-        costs = torch.stack([prepared.cost(start.x[index]), prepared.cost(cold)], -1)
+        evaluate = evaluator(part.coarse)
+        costs = torch.stack([evaluate.cost(start.x[index]), evaluate.cost(cold)], -1)
     else:
         costs = start.costs[index]
     guessed, known = costs.nan_to_num(torch.inf).unbind(-1)
     worse = ~(guessed < known)
-    dropped = torch.zeros_like(start.warm).index_copy(0, index, worse)
-    x = start.x.clone()
-    x[dropped] = cold[worse]
+    dropped = torch.zeros_like(start.challenged).index_copy(0, index, worse)
+    x, origin = start.x.clone(), start.origin.clone()
+    x[dropped], origin[dropped] = cold[worse], int(Origin.COLD)
     spread = None if start.Sigma0 is None else torch.where(dropped[:, None, None], Sigma0, start.Sigma0)
-    return Start(x, spread, start.warm & ~dropped), dropped
+    return Start(x, origin, start.challenged & ~dropped, spread), dropped

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..analysis.count import Evidence
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
-from ..estimation.fit import Evidence, Fit
 from ..estimation.load_profile import Profile
-from ..estimation.result import Estimate
+from ..estimation.result import Estimate, FittedRod
 from ..util.errors import InputError
 from ..util.files import put, put_text, reading
 from ..util.status import Status
@@ -154,7 +154,7 @@ def write_result(
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
         names["hypotheses"] = np.array(evidence.names)
-    for name in ("magnitude_location_covariance", "location_interval"):
+    for name in ("magnitude_location_covariance", "location_interval", "warm_started"):
         arrays[name] = getattr(estimate, name)
     if noise is not None:
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
@@ -226,7 +226,7 @@ def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[list[object], list[obj
     return values, [profile["s_m"], profile["f_local_N_per_m"], band]
 
 
-def read_fit(path: str | Path, sample: str, robot: str | None = None, markers: int | None = None) -> Fit:
+def read_fit(path: str | Path, sample: str, robot: str | None = None, markers: int | None = None) -> FittedRod:
     """One sample of a RESULT.json or RESULT.npz.
 
     robot, markers: the robot's name and the number of markers; a file that says otherwise is refused.
@@ -240,7 +240,7 @@ def read_fit(path: str | Path, sample: str, robot: str | None = None, markers: i
             return _read_fit(_Asked(path, sample, robot, markers), opened)
 
 
-def _read_fit(asked: _Asked, opened: IO[bytes]) -> Fit:
+def _read_fit(asked: _Asked, opened: IO[bytes]) -> FittedRod:
     try:
         values, stored = (_arrays_of if asked.path.suffix == ".npz" else _record_of)(asked, opened)
         *loads, wrench, zeta, tip, interval = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in values]
@@ -266,4 +266,4 @@ def _read_fit(asked: _Asked, opened: IO[bytes]) -> Fit:
     if not all(bool(torch.isfinite(t).all()) for t in [*loads, wrench, zeta, tip] if t is not None):
         raise InputError(f"{asked.path}: sample {asked.sample} has no fit to draw; see its message")
     assert wrench is not None
-    return Fit(loads[0], loads[1], loads[2], wrench, zeta, tip, interval, profile)
+    return FittedRod(loads[0], loads[1], loads[2], wrench, zeta, tip, interval, profile)

@@ -5,30 +5,44 @@ import io
 import math
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ..mechanics.grid import on_rod
 from ..mechanics.robot import Robot
 from ..model.marker_geometry import too_far, too_short
-from ..model.measurement import Markers
+from ..model.sensors import Markers
 from ..util.errors import InputError
 from ..util.files import put_text, reading
+from ..util.precision import Float64
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
-class Shapes:
-    """Markers of named samples."""
+class Shapes(Float64):
+    """Marker positions of B named samples, as a file holds them; their noise is not in it.
 
-    markers: Markers
+    s: (P,) m. positions: (B, P, 3) m, base frame, NaN where missing. samples: their names. offsets: (P, 3) m, from the centre line
+    in the section frame. tension: (B, T) N, readings of the load cells.
+    """
+
+    s: Float[Tensor, " P"]
+    positions: Float[Tensor, "B P 3"]
     samples: list[str]
+    offsets: Float[Tensor, "P 3"] | None = None
+    tension: Float[Tensor, "B T"] | None = None
+
+    def markers(self, noise: float | Float[Tensor, " B"]) -> Markers:
+        """The sensor, with the standard deviation of a coordinate (m), one for all samples or one for each."""
+        return Markers(self.s, self.positions, noise, self.offsets)
 
 
 def read_shapes(path: str | Path, robot: Robot) -> Shapes:
@@ -41,12 +55,12 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
             raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
         with path.open("rb") as file:
             shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
-    markers, L = shapes.markers, robot.rod.length
+    markers, L = shapes, robot.rod.length
     outside = ~on_rod(markers.s, L)
     if bool(outside.any()):
         hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
-    if said := too_short(markers.s, L) or too_far(markers, L):
+    if said := too_short(markers.s, L) or too_far(markers.markers(1.0), L):
         raise InputError(f"{path}: {said}")
     T = len(robot.tendons)
     if T and markers.tension is None:
@@ -56,7 +70,7 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
         raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; give one per tendon, in N")
     if markers.tension is not None and bool((markers.tension < 0).any()):
         raise InputError(f"{path}: tension {float(markers.tension.min()):g} N is negative; a tendon can only pull, give at least 0")
-    return Shapes(Markers(markers.s.clamp(0, L), markers.positions, markers.offsets, markers.tension), shapes.samples)
+    return replace(shapes, s=shapes.s.clamp(0, L))
 
 
 def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: str) -> None:
@@ -108,8 +122,8 @@ def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
             )
     _increasing(path, data["s"], data.get("offsets"), "all")
     tensor = {key: torch.from_numpy(value) for key, value in data.items()}
-    markers = Markers(tensor["s"], tensor["positions"], tensor.get("offsets"), tensor.get("tensions"))
-    return Shapes(markers, [str(i) for i in range(B)])
+    names = [str(i) for i in range(B)]
+    return Shapes(tensor["s"], tensor["positions"], names, tensor.get("offsets"), tensor.get("tensions"))
 
 
 def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
@@ -180,14 +194,12 @@ def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, f
             positions[b, index[tuple(row[k] for k in keys)]] = torch.tensor([row[k] for k in "xyz"], dtype=torch.float64)
     table = torch.tensor(places, dtype=torch.float64)
     tension = torch.tensor([[rows[0][t] for t in tensions] for rows in samples.values()], dtype=torch.float64) if tensions else None
-    return Shapes(
-        Markers(table[:, 0].contiguous(), positions, table[:, 1:].contiguous() if has_offsets else None, tension), list(samples)
-    )
+    return Shapes(table[:, 0].contiguous(), positions, list(samples), table[:, 1:].contiguous() if has_offsets else None, tension)
 
 
 def write_shapes(path: str | Path, shapes: Shapes) -> None:
     """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells. Errors: InputError."""
-    markers = shapes.markers
+    markers = shapes
     tensions = [] if markers.tension is None else [f"tension_{i + 1}" for i in range(markers.tension.shape[-1])]
     header = ["sample", *REQUIRED, *([] if markers.offsets is None else OFFSETS), *tensions]
     text = io.StringIO()

@@ -193,9 +193,9 @@ class Sums:
     line: Float[Tensor, "B P 3"]
 
     @classmethod
-    def room(cls, B: int, n: int, P: int) -> "Sums":
-        """To be written."""
-        sizes = ((B, 2, n, n), (B, 2, n), (B, 2), (B, 3 * P + 6), (B, P, 3))
+    def room(cls, B: int, n: int, z: int, P: int) -> "Sums":
+        """To be written, for n unknowns, z rows and P places."""
+        sizes = ((B, 2, n, n), (B, 2, n), (B, 2), (B, z), (B, P, 3))
         return cls(*(torch.empty(size, dtype=torch.float64) for size in sizes))
 
     def put(self, index: Int[Tensor, " b"], other: "Sums") -> None:

@@ -25,8 +25,7 @@
 Source: kriging, e.g. Rasmussen & Williams 2006, eq. (2.23); what to feed and to divide by: measured (docs/training.md).
 """
 
-from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,8 +33,9 @@ from torch import Tensor
 
 from ..estimation.at_rest import without_load
 from ..mechanics.robot import Robot
-from ..model.measurement import Markers, Model
-from ..util.kept import version
+from ..model.problem import Problem
+from ..model.sensors import Markers
+from ..util.by_value import Kept, key
 from ..util.precision import DTYPE
 
 GRID = 20  # points of the grid
@@ -46,6 +46,7 @@ MISSING_VARIANCE = 1e6
 AMP_LEAST = 1e-6  # a straighter rod has no direction and no size
 PASSIVE_SIZE = 5 * GRID + 6
 ACTIVE_SIZE = PASSIVE_SIZE + STATIONS * 6 + 3
+_kriged = Kept()
 MIRROR_MARGIN = 1e-6  # a bend this planar (in amp) is not mirrored: round-off must not decide
 
 
@@ -97,15 +98,13 @@ def kriging(s: Float[Tensor, " P"], seen: Bool[Tensor, "U P"], sigma: float) -> 
     return torch.cholesky_solve(cross.expand(len(seen), -1, -1), factor).mT
 
 
-@lru_cache(maxsize=32)
-def _kriging_of_all(s: Float[Tensor, " P"], version: int, length: float, sigma: float) -> Float[Tensor, "1 2G P"]:
-    """Where every marker was seen, kept for the next shapes unless s has been changed since."""
-    return kriging(s / length, torch.ones(1, len(s), dtype=torch.bool), sigma)
+def _kriging_of_all(s: Float[Tensor, " P"], length: float, sigma: float) -> Float[Tensor, "1 2G P"]:
+    """Where every marker was seen, kept for the next shapes with the same arc lengths."""
+    return _kriged((key(s), length, sigma), lambda: kriging(s / length, torch.ones(1, len(s), dtype=torch.bool), sigma))
 
 
-@lru_cache(maxsize=32)
-def _places(s: Float[Tensor, " P"], version: int, length: float) -> Float[Tensor, " Q"]:
-    """The markers, the stations and the grid (m), likewise."""
+def _places(s: Float[Tensor, " P"], length: float) -> Float[Tensor, " Q"]:
+    """The markers, the stations and the grid (m)."""
     stations, grid = (torch.linspace(length / n, length, n, dtype=DTYPE) for n in (STATIONS, GRID))
     return torch.cat([s, stations, grid])
 
@@ -116,7 +115,7 @@ def smoothed(
     """(2) from displacements over L; s, length and noise in m. Each pattern of markers seen is solved once."""
     y = torch.where(seen.unsqueeze(-1), y, 0.0)
     if bool(seen.all()):
-        rows = y.mT.flatten(0, 1) @ _kriging_of_all(s, version(s), length, noise / length)[0].mT  # one product for all samples
+        rows = y.mT.flatten(0, 1) @ _kriging_of_all(s, length, noise / length)[0].mT  # one product for all samples
         out = rows.unflatten(0, (-1, 3)).mT
     else:
         patterns, which = torch.unique(seen, dim=0, return_inverse=True)
@@ -142,12 +141,19 @@ def _facing(way: Float[Tensor, "B 3"]) -> Float[Tensor, "B 4"]:
     return torch.nn.functional.normalize(q, dim=-1)
 
 
-def features(model: Model, markers: Markers, noise: float) -> Features:
-    """(1)-(5) of B samples. noise: m. A sample without markers reads as an unbent rod."""
-    L, seen, P = model.robot.rod.length, markers.present, len(markers.s)
+def noise_of(markers: Markers) -> float:
+    """The noise (m) that stands for a batch in which each sample has its own: the middle one."""
+    return float(markers.noise.median()) if isinstance(markers.noise, Tensor) else markers.noise
+
+
+def features(problem: Problem) -> Features:
+    """(1)-(5) of B samples, of which nothing but markers was measured. A sample without markers reads as an unbent rod."""
+    robot, markers = problem.robot, problem.markers
+    assert markers is not None
+    L, seen, P, noise = robot.rod.length, markers.present, len(markers.s), noise_of(markers)
     stations = torch.linspace(L / STATIONS, L, STATIONS, dtype=DTYPE)
-    places = _places(markers.s, version(markers.s), L)
-    rest = without_load(model, replace(markers, s=places, offsets=None))
+    places = _places(markers.s, L)
+    rest = without_load(problem, places)
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
     p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
     sigma = torch.tensor(noise / L, dtype=DTYPE)
@@ -158,30 +164,30 @@ def features(model: Model, markers: Markers, noise: float) -> Features:
     def turned(v: Float[Tensor, "B S 3"]) -> Float[Tensor, "B S3"]:
         return torch.cat([v[..., :2] @ turn.mT, v[..., 2:]], -1).flatten(1)
 
-    size, count, log_c = amp.unsqueeze(-1), seen.sum(-1).to(DTYPE), torch.full_like(amp, prior_log_c(model))
+    size, count, log_c = amp.unsqueeze(-1), seen.sum(-1).to(DTYPE), torch.full_like(amp, prior_log_c(problem))
     parts = [5 * turned(y) / size, (k[..., :2] @ turn.mT).flatten(1) / size, size.log(), size]
     parts += [torch.stack([sigma.log().expand_as(amp), (sigma / amp).log(), log_c, (20 / count.clamp(min=1)).log()], -1)]
-    if is_active(model.robot):
-        pull, moment, weight = _known(model.robot, markers, stations)
+    if is_active(robot):
+        pull, moment, weight = _known(robot, problem.tension, len(amp), stations)
         moment = turned(moment).unflatten(-1, (STATIONS, 3))[..., :2].flatten(1)
         parts += [pull, moment, turned(weight), turned(p0[:, P : P + STATIONS] / L)]
     q_tip = _facing((p0[:, -1] + L * y[:, -1]) - (p0[:, -2] + L * y[:, -2]))
     return Features(torch.cat(parts, -1), amp, turn, count, rest.wrench.nan_to_num(0.0), q_tip, p0[:, :P])
 
 
-def prior_log_c(model: Model) -> float:
+def prior_log_c(problem: Problem) -> float:
     """The prior mean of log(c L^2), which closes every Gaussian load's entries of gamma."""
-    return float(model.prior()[0][model.coordinates.size - 1])
+    return float(problem.state.loads.mean[-1])
 
 
 def _known(
-    robot: Robot, markers: Markers, stations: Float[Tensor, " S"]
+    robot: Robot, tension: Float[Tensor, "B T"] | None, B: int, stations: Float[Tensor, " S"]
 ) -> tuple[Float[Tensor, "B S"], Float[Tensor, "B S 3"], Float[Tensor, "B 1 3"]]:
     """The tendons' pull and moment and the weight of (5)."""
-    rod, B = robot.rod, len(markers.positions)
+    rod = robot.rod
     pull, moment = torch.zeros(B, STATIONS, dtype=DTYPE), torch.zeros(B, STATIONS, 3, dtype=DTYPE)
-    if markers.tension is not None and len(robot.tendons):
-        tension = markers.tension.nan_to_num(0.0)
+    if tension is not None and len(robot.tendons):
+        tension = tension.nan_to_num(0.0)
         on = torch.stack([stations <= t.ends_at * (1 + 1e-9) for t in robot.tendons.tendons]).to(DTYPE)
         r = torch.stack([t.offset_at(stations)[0] for t in robot.tendons.tendons])
         pull = tension @ on / rod.force_scale

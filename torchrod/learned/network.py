@@ -26,7 +26,6 @@ from torch import Tensor
 from .. import kernel
 from ..util.errors import InputError
 from ..util.files import reading
-from ..util.kept import version
 
 SCHEMA = 1  # of the card
 PER_LOAD = 4
@@ -100,7 +99,7 @@ class Network(torch.nn.Module):
         """The last hidden layer: by the compiled kernel where it serves and no derivative is wanted."""
         plain = x.dtype == self.mean.dtype == torch.float64 and x.device.type == "cpu"
         if plain and not self.head.weight.requires_grad and not x.requires_grad and kernel.available():
-            return self._compiled(tuple(version(p) for p in self.body.parameters()))(self._scaled(x))
+            return self._compiled(tuple(0 if p.is_inference() else p._version for p in self.body.parameters()))(self._scaled(x))
         return self.body(self._scaled(x))
 
     def _scaled(self, x: Float[Tensor, "B i"]) -> Float[Tensor, "B i"]:

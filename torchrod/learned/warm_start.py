@@ -10,12 +10,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..estimation.at_rest import at_rest
-from ..estimation.starts import Start, cold_from, cold_start, costs_in_equilibrium
+from ..estimation.starts import Origin, Start, cold_from, cold_start
 from ..mechanics.rod import Rod
 from ..model.load_families import GaussianCoordinates
-from ..model.measurement import Markers, Model
+from ..model.problem import Problem
+from ..model.sensors import Markers
+from ..model.sensors.sensor import variance
 from ..util.errors import InputError
-from .features import Features, features, is_active, prior_log_c
+from .features import Features, features, is_active, noise_of, prior_log_c
 from .network import PER_LOAD, Network, load_checkpoint, turn_of_gamma
 
 SLACK = 1.001  # on a stated range: 0.1 mm on 0.4 m is 2.5e-4 but for round-off
@@ -50,52 +52,55 @@ class WarmStart:
             raise InputError(f"{path}: its card lacks {error}; train it again") from None
         return cls(network, card, bool(card["predicted_spread"]))
 
-    def misfit(self, model: Model, markers: Markers | None = None, noise: float | None = None) -> str | None:
-        """Why this start cannot serve a model, and markers and a noise (m) if given, in one sentence; None where it can."""
-        reason = _coordinates_misfit(self.card, model) or _robot_misfit(self.card, model)
-        if reason is None and noise is not None:
-            reason = _noise_misfit(self.card, noise / model.robot.rod.length)
-        return reason if reason is not None or markers is None else _markers_misfit(self.card, markers)
+    def misfit(self, problem: Problem, measured: bool = True) -> str | None:
+        """Why this start cannot serve a problem, in one sentence; None where it can. measured=False leaves the readings aside."""
+        reason = _unknowns_misfit(self.card, problem) or _robot_misfit(self.card, problem)
+        markers = problem.markers
+        if reason is not None or not measured or markers is None:
+            return reason
+        return _noise_misfit(self.card, noise_of(markers) / problem.robot.rod.length) or _markers_misfit(self.card, markers)
 
-    def known(self, markers: Markers, read: Features) -> Bool[Tensor, " B"]:
+    def known(self, problem: Problem, read: Features) -> Bool[Tensor, " B"]:
         """Samples whose bend and number of markers lie in the range that was learned."""
         (low, high), (fewest, most) = self.card["range"]["amp"], self.card["range"]["markers_seen"]
         inside = (read.amp >= low) & (read.amp <= high) & (read.seen >= fewest) & (read.seen <= most)
-        return inside if markers.tension is None else inside & torch.isfinite(markers.tension).all(-1)
+        return inside if problem.tension is None else inside & torch.isfinite(problem.tension).all(-1)
 
-    def __call__(self, model: Model, markers: Markers, noise: float) -> Start:
+    def __call__(self, problem: Problem) -> Start:
         """gamma from the network, alpha from the equilibrium under it; cold where the sample lies outside of what was learned.
 
-        Errors: InputError if strict, where the checkpoint does not fit the model or the noise at all.
+        Errors: InputError if strict, where the checkpoint does not fit the robot, the unknowns or the noise at all.
         """
-        reason = self.misfit(model, None, noise)
+        markers = problem.markers
+        reason = self.misfit(problem, False)
+        if reason is None and markers is not None:
+            reason = _noise_misfit(self.card, noise_of(markers) / problem.robot.rod.length)
         if reason is not None and self.strict:
             raise InputError(f"checkpoint {self.card['name']}: {reason}")
-        if reason is not None or markers.offsets is not None:
-            return cold_start(model, markers, noise)
-        read = features(model, markers, noise)
-        warm, size = self.known(markers, read), model.coordinates.size
-        index, cold = warm.nonzero().squeeze(-1), cold_from(model, read.alpha)
+        if reason is not None or markers is None or markers.offsets is not None:
+            return cold_start(problem)
+        read = features(problem)
+        warm, at = self.known(problem, read), problem.state.loads.at
+        index, cold = warm.nonzero().squeeze(-1), cold_from(problem, read.alpha)
+        origin = torch.where(warm, int(Origin.LEARNED), int(Origin.COLD))
         if not len(index):
-            return Start(cold, None, warm)
-        everything = len(index) == len(warm)
-        part, seen = (read, markers) if everything else (read.take(index), markers.take(index))
-        gamma, spread = self.guess(model, part)
-        rest = at_rest(model, seen, gamma, part.q_tip)
-        guessed = model.join(gamma, rest.wrench.nan_to_num(0.0))
+            return Start(cold, origin, warm)
+        part, seen = (read, problem) if len(index) == len(warm) else (read.take(index), problem.take(index))
+        gamma, spread = self.guess(problem, part)
+        rest = at_rest(seen, gamma, part.q_tip)
+        guessed = problem.state.join(gamma, rest.wrench.nan_to_num(0.0))
         x, costs = cold.index_copy(0, index, guessed), cold.new_zeros(len(cold), 2)
-        both = torch.stack([guessed, cold[index]], 1), torch.stack([rest.p, part.p0], 1)
-        costs[index] = costs_in_equilibrium(model, seen, noise, *both)
+        costs[index] = _costs(seen, torch.stack([guessed, cold[index]], 1), torch.stack([rest.p, part.p0], 1))
         if spread is None:
-            return Start(x, None, warm, cold, costs)
-        Sigma0 = torch.eye(model.size, dtype=x.dtype).repeat(len(x), 1, 1)
-        Sigma0[index, :size, :size] = spread
-        return Start(x, Sigma0, warm, cold, costs)
+            return Start(x, origin, warm, None, cold, costs)
+        Sigma0 = torch.eye(problem.size, dtype=x.dtype).repeat(len(x), 1, 1)
+        Sigma0[index, at, at] = spread
+        return Start(x, origin, warm, Sigma0, cold, costs)
 
-    def guess(self, model: Model, read: Features) -> tuple[Float[Tensor, "B g"], Float[Tensor, "B g g"] | None]:
+    def guess(self, problem: Problem, read: Features) -> tuple[Float[Tensor, "B g"], Float[Tensor, "B g g"] | None]:
         """What the network says of features: gamma, and its covariance if that is to be believed; in the section frame."""
-        turn = turn_of_gamma(read.turn, model.coordinates.size // PER_LOAD)
-        log_c = torch.full_like(read.amp, prior_log_c(model))
+        turn = turn_of_gamma(read.turn, problem.unknowns.loads.size // PER_LOAD)
+        log_c = torch.full_like(read.amp, prior_log_c(problem))
         if not self.predicted_spread:
             return _turned(turn, self.network.guess(read.x, read.amp, log_c)), None
         prediction = self.network(read.x, read.amp, log_c)
@@ -114,20 +119,32 @@ def bounded(covariance: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
     return wide
 
 
+def _costs(problem: Problem, x: Float[Tensor, "B k n"], p: Float[Tensor, "B k P 3"]) -> Float[Tensor, "B k"]:
+    """The cost of (3) with the prior's at k states x, whose markers p (m) in equilibrium are known: there is no tip residual."""
+    markers = problem.markers
+    assert markers is not None
+    square = (markers.positions.unsqueeze(1) - p).square().sum(-1)
+    seen = torch.where(markers.present.unsqueeze(1), square, 0.0).sum(-1)
+    mean, precision = problem.mean.unsqueeze(-2), problem.precision.unsqueeze(-2)
+    return seen / variance(markers.noise) + (precision * (mean - x) ** 2).sum(-1)
+
+
 RANGES = ("amp", "noise_over_length", "markers_seen", "shear_over_bending", "torsion_over_bending")
 
 
-def _coordinates_misfit(card: dict[str, Any], model: Model) -> str | None:
-    coordinates = model.coordinates
-    if not isinstance(coordinates, GaussianCoordinates) or not model.scaled:
+def _unknowns_misfit(card: dict[str, Any], problem: Problem) -> str | None:
+    unknowns, coordinates = problem.unknowns, problem.unknowns.loads
+    if problem.markers is None:
+        return "it reads markers, and here other sensors were read as well"
+    if not isinstance(coordinates, GaussianCoordinates) or not unknowns.scaled:
         return "it knows Gaussian loads in scaled coordinates only"
     if coordinates.locations is not None:
         return "it predicts locations, and here they are known; leave out --location or --warm-start"
-    if model.registration:
+    if unknowns.registration is not None:
         return "it was not trained with a registration error; leave out --registration or --warm-start"
-    if model.tension_std is not None:
+    if unknowns.tension_std is not None:
         return "it was trained with tensions that are known; leave out --tension-std or --warm-start"
-    if model.tip != "none":
+    if unknowns.tip != "none":
         return "it was not trained with an unknown force at the tip; leave out --unknown-tip or --warm-start"
     if coordinates.count != card["contacts"]:
         return f"it was trained for {card['contacts']} loads, and here are {coordinates.count}"
@@ -136,8 +153,8 @@ def _coordinates_misfit(card: dict[str, Any], model: Model) -> str | None:
     return None
 
 
-def _robot_misfit(card: dict[str, Any], model: Model) -> str | None:
-    robot, rod = model.robot, model.robot.rod
+def _robot_misfit(card: dict[str, Any], problem: Problem) -> str | None:
+    robot, rod = problem.robot, problem.robot.rod
     if is_active(robot) != card["active"]:
         return "it was trained " + ("for" if card["active"] else "without") + " tendons and weight, unlike this robot"
     least, most = card["tendons"]
@@ -194,6 +211,6 @@ def shipped() -> tuple[WarmStart, ...]:
     return tuple(replace(WarmStart.read(path), strict=False) for path in paths)
 
 
-def find_warm_start(model: Model) -> WarmStart | None:
-    """The shipped checkpoint that fits a model, or None: then every start is cold."""
-    return next((start for start in shipped() if start.misfit(model) is None), None)
+def find_warm_start(problem: Problem) -> WarmStart | None:
+    """The shipped checkpoint that fits a problem's robot and unknowns, or None: then every start is cold."""
+    return next((start for start in shipped() if start.misfit(problem, False) is None), None)

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..util.kept import versions
 from ..util.precision import DTYPE, Float64
 from .lie import Vector
 from .loads import LoadIntegrals
@@ -22,11 +21,6 @@ class Robot(Float64):
     tendons: Tendons = field(default_factory=Tendons)
     gravity: Vector = field(default_factory=lambda: torch.zeros(3, dtype=DTYPE))
     name: str = "rod"
-
-    @property
-    def versions(self) -> tuple[int, ...]:
-        """Others when a tensor of the robot has been changed in place: what is kept of it no longer holds then."""
-        return versions(self.gravity, *vars(self.rod).values())
 
     @property
     def weight(self) -> Vector:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .measurement import Markers
+from .sensors import Markers
 
 UNITS = {1e6: "micrometres", 1e3: "millimetres", 1e2: "centimetres", 39.37: "inches"}
 ALIKE = 1.5  # a ratio is that of a unit within this factor

@@ -15,12 +15,11 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
-from ..estimation.fit import Fit
+from ..estimation.result import FittedRod
 from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.lie import move, rotate
 from ..mechanics.robot import Robot
 from ..mechanics.statics import shape_from_base
-from ..model.measurement import Markers
 from ..util.files import put
 from ..util.precision import DTYPE
 
@@ -42,7 +41,7 @@ class _Scene:
     tendons: list[Tensor]
 
 
-def _scene(robot: Robot, fit: Fit, tension: Tensor | None) -> _Scene:
+def _scene(robot: Robot, fit: FittedRod, tension: Tensor | None) -> _Scene:
     L = robot.rod.length
     loads = fit.loads(L)
     near = (fit.location.unsqueeze(-1) + fit.width.unsqueeze(-1) * torch.linspace(-3, 3, 25, dtype=DTYPE)).flatten().clamp(0, L)
@@ -107,21 +106,27 @@ def _arrows(axes: Axes3D, scene: _Scene, colour: str, width: float, label: str, 
         axes.quiver(x, y, z, *way, color=colour, linewidth=width, arrow_length_ratio=0.18, label=name, zorder=order)
 
 
-def _label(fit: Fit, k: int) -> str:
+def _label(fit: FittedRod, k: int) -> str:
     if k == len(fit.force) and fit.tip_force is not None:
         return f"{float(fit.tip_force.norm()):.3g} N at the tip"
     return f"{float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
 
 
-def draw_on(axes: Axes3D, robot: Robot, fit: Fit, markers: Markers, sample: int, truth: Fit | None = None) -> None:
-    """Draw one sample: markers (teal), fitted rod (dark), loads (red), equal axes in metres.
+def draw_on(
+    axes: Axes3D,
+    robot: Robot,
+    fit: FittedRod,
+    positions: Float[Tensor, "P 3"],
+    tension: Float[Tensor, " T"] | None = None,
+    truth: FittedRod | None = None,
+) -> None:
+    """Draw one sample: markers at positions (m, teal; NaN where missing), fitted rod (dark) under its tensions (N), loads (red).
 
-    truth: the true loads where they are known (grey, and in the title).
+    Equal axes in metres. truth: the true loads where they are known (grey, and in the title).
     """
     axes.computed_zorder = False  # by depth, the arrow of a good estimate would vanish behind the true one
-    tension = None if markers.tension is None else markers.tension[sample]
     scene = _scene(robot, fit, tension)
-    seen = markers.positions[sample][markers.present[sample]]
+    seen = positions[torch.isfinite(positions).all(-1)]
     for i, line in enumerate(scene.tendons):
         axes.plot(*line.T.numpy(), color=TENDON, linewidth=1.2, zorder=1, label=None if i else "tendons")
     axes.plot(*scene.line.T.numpy(), color=INK, linewidth=2.5, zorder=4, label="fitted rod")
@@ -158,7 +163,7 @@ def _stems(axes: Axes, at: Float[Tensor, " K"], value: Float[Tensor, " K"]) -> N
     axes.plot(1e3 * at, value, "o", color=LOAD, ms=6)
 
 
-def _where(axes: Axes, fit: Fit) -> None:
+def _where(axes: Axes, fit: FittedRod) -> None:
     """The contacts and the 95 % intervals of their locations, in a row above the curves."""
     at = 1e3 * fit.location
     interval = torch.full_like(at, torch.nan).unsqueeze(-1) if fit.location_interval is None else 1e3 * fit.location_interval
@@ -168,7 +173,7 @@ def _where(axes: Axes, fit: Fit) -> None:
     axes.errorbar(at, torch.full_like(at, ROW), xerr=reach.numpy(), label="contact location, 95 %", **look)
 
 
-def draw_profile_on(axes: Sequence[Axes], fit: Fit, length: float) -> None:
+def draw_profile_on(axes: Sequence[Axes], fit: FittedRod, length: float) -> None:
     """f_x, f_y and |f| along the rod (N/m), section frame, in three axes one above the other, each with its 95 % band.
 
     Above |f| the contacts with the intervals of their locations. Point forces (no profile) are stems (N). length: L (m).
@@ -195,7 +200,14 @@ def draw_profile_on(axes: Sequence[Axes], fit: Fit, length: float) -> None:
     axes[-1].set_xlabel("arc length from the base, s (mm)", fontsize=12)
 
 
-def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int, title: str) -> None:
+def draw(
+    path: str | Path,
+    robot: Robot,
+    fit: FittedRod,
+    positions: Float[Tensor, "P 3"],
+    tension: Float[Tensor, " T"] | None,
+    title: str,
+) -> None:
     """Write the figure of one sample: the rod by `draw_on`, and beside it the loads along it by `draw_profile_on`.
 
     Errors: InputError where the file cannot be written.
@@ -205,7 +217,7 @@ def draw(path: str | Path, robot: Robot, fit: Fit, markers: Markers, sample: int
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
     axes = figure.add_subplot(grid[:, 0], projection="3d")
     assert isinstance(axes, Axes3D)
-    draw_on(axes, robot, fit, markers, sample)
+    draw_on(axes, robot, fit, positions, tension)
     panels = [figure.add_subplot(grid[i, 1]) for i in range(3)]
     draw_profile_on(panels, fit, robot.rod.length)
     figure.suptitle(textwrap.fill(title, 120), fontsize=13, parse_math=False)  # a name may hold a $

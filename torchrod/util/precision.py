@@ -18,9 +18,11 @@ def as_float64(x: Tensor | None) -> Tensor | None:
 
 
 class Float64:
-    """A frozen dataclass whose tensors of numbers are made float64; flags stay flags."""
+    """A frozen dataclass whose tensors of numbers are made float64; flags stay flags. Errors: ValueError for complex numbers."""
 
     def __post_init__(self):
         for name, value in vars(self).items():
+            if isinstance(value, Tensor) and value.is_complex():
+                raise ValueError(f"{type(self).__name__}.{name} is complex; give real numbers")
             if isinstance(value, Tensor) and value.dtype not in (DTYPE, torch.bool):
                 object.__setattr__(self, name, value.to(DTYPE))

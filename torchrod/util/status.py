@@ -1,4 +1,4 @@
-"""What became of a sample and of its learned start, and what its owner can do about it."""
+"""What became of a sample, and what its owner can do about it."""
 
 from enum import IntEnum
 
@@ -26,24 +26,4 @@ _MESSAGES = {
     Status.NOT_CONVERGED: "Did not converge: check units, marker order and tensions; then state more noise or more iterations.",
     Status.INVALID: "No fit: too few markers for the unknowns, or numbers that leave the rod no shape; "
     "give this sample more markers or fewer unknown loads, and check the units of robot and tensions.",
-}
-
-
-class Learned(IntEnum):
-    """What became of a sample's learned start; `.message` says so where it was not simply used."""
-
-    NONE = 0
-    USED = 1
-    DROPPED = 2
-    RETRIED = 3
-
-    @property
-    def message(self) -> str:
-        """One sentence, or nothing."""
-        return _LEARNED.get(self, "")
-
-
-_LEARNED = {
-    Learned.DROPPED: "The learned start was no nearer to the markers than a cold one and was dropped.",
-    Learned.RETRIED: "The fit from the learned start was not accepted, so a cold start was tried as well.",
 }

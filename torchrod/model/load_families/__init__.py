@@ -4,7 +4,7 @@ The filter works on gamma; these classes are the only place that knows what its 
 start, a Gaussian prior (mean and precision per entry; precision 0 for none) and describe(gamma), the quantities a person asks for.
 """
 
-from .base import Gamma, LoadCoordinates, LoadReport
+from .family import Gamma, LoadFamily, LoadReport
 from .fourier import FourierCoordinates
 from .gaussian import WIDTH_OF_PRIOR, GaussianCoordinates
 from .paper import PaperCoordinates
@@ -15,7 +15,7 @@ __all__ = [
     "FourierCoordinates",
     "Gamma",
     "GaussianCoordinates",
-    "LoadCoordinates",
+    "LoadFamily",
     "LoadReport",
     "PaperCoordinates",
     "PointCoordinates",

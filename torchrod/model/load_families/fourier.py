@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...mechanics.loads import FourierLoads, Load
 from ...util.precision import DTYPE
-from .base import WEAK_STD, Gamma, LoadReport
+from .family import WEAK_STD, Gamma, LoadReport
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...mechanics.loads import GaussianLoads, Load, on_rod_fraction
 from ...util.precision import DTYPE
-from .base import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
+from .family import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
 
 WIDTH_OF_PRIOR = {"point": 1 / 100, "contact": 1 / 40, "distributed": 1 / 4}  # sigma / L: 4, 10 and 100 mm on the paper's rod
 LOG_C_STD = 1.0  # of the weak prior on log c

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...mechanics.loads import GaussianLoads, Load, on_rod_fraction
 from ...util.precision import DTYPE
-from .base import Gamma, LoadReport, logit
+from .family import Gamma, LoadReport, logit
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from ...mechanics.lie import Vector
 from ...mechanics.loads import Load, PointForces
 from ...util.precision import DTYPE
-from .base import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
+from .family import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ class LoadReport:
 
 
 @runtime_checkable
-class LoadCoordinates(Protocol):
+class LoadFamily(Protocol):
     """What every parameterization supplies."""
 
     @property

@@ -1,0 +1,135 @@
+"""The whole way from readings to an answer: noise, number of loads, common frame, judgement, diagnosis, load profile."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from ..estimation.load_profile import Profile, joined_profile
+from ..estimation.result import Estimate
+from ..estimation.shared import STEPS, BaseFrame, with_shared_frame
+from ..estimation.solve import Settings, estimate_each
+from ..estimation.starts import StartRule, cold_start
+from ..learned.warm_start import find_warm_start
+from ..model.load_families import GaussianCoordinates
+from ..model.problem import Problem
+from ..model.unknowns import Scope, Unknowns
+from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, select
+from .diagnosis import Diagnosis, diagnose
+from .noise import Noise, estimate_noise_among, with_noise
+
+
+def learned_or_cold(problem: Problem) -> StartRule:
+    """The shipped checkpoint that fits a problem, else a cold start."""
+    return find_warm_start(problem) or cold_start
+
+
+def contact_hypotheses(
+    problem: Problem,
+    contacts: int | str = "auto",
+    load_prior: str = "contact",
+    locations: Sequence[float] | None = None,
+) -> list[Hypothesis]:
+    """What competes to explain the readings of a problem: numbers of Gaussian loads, priors of their width, something at the tip.
+
+    contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
+    against distributed. locations: known ones (m), one for each contact. With contacts "auto" an unknown tip of the problem's
+    unknowns competes with nothing at the tip; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
+    prior.
+    """
+    known, rod = problem.unknowns, problem.robot.rod
+    counts = range(MAX_CONTACTS + 1) if contacts == "auto" else [int(contacts)]
+    priors = ["contact", "distributed"] if load_prior == "auto" else [load_prior]
+    tips = ["none", known.tip] if contacts == "auto" and known.tip != "none" else [known.tip]
+    at = None if locations is None else tuple(locations)
+    found = []
+    for k in counts:
+        for tip in tips:
+            for prior in priors if k else priors[:1]:
+                name = f"{k} {prior}" if len(priors) > 1 and k else str(k)
+                name += f" + tip {tip}" if len(tips) > 1 and tip != "none" else ""
+                loads = GaussianCoordinates(k, rod.length, rod.force_scale, prior, at)
+                found.append(Hypothesis(name, k, replace(known, loads=loads, tip=tip)))
+    return found
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """What `analyze` has found of B samples.
+
+    problem: as it was fitted in the end, with the noise and in the base frame that were found. estimate: loads and how sure. parts:
+    the unknowns that were chosen, each with the samples that chose it. evidence: what spoke for each hypothesis; None where there
+    was one. noise: where it was estimated, else None. frame: the base frame's error that all samples share, else None. diagnosis:
+    what is wrong with samples that no fit explains.
+    """
+
+    problem: Problem
+    estimate: Estimate
+    parts: Sequence[tuple[Unknowns, Int[Tensor, " b"]]]
+    evidence: Evidence | None
+    noise: Noise | None
+    frame: BaseFrame | None
+    diagnosis: Diagnosis
+
+    @cached_property
+    def profile(self) -> Profile | None:
+        """f(s) of every sample with its band; None for point loads, which have no density."""
+        return joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
+
+    def message(self, sample: int) -> str:
+        """What became of a sample, what is wrong with it, and what to do."""
+        return f"{self.estimate.message(sample)} {self.diagnosis.message(sample)}".rstrip()
+
+
+def analyze(
+    problem: Problem,
+    candidates: Sequence[Hypothesis] | None = None,
+    unknown_noise: bool = False,
+    settings: Settings | None = None,
+    start: StartFor = learned_or_cold,
+    bar: Bar = no_bar,
+) -> Analysis:
+    """Everything that `torchrod estimate` does, from readings to judged loads.
+
+    problem: robot, unknowns and readings. candidates: hypotheses that compete (`contact_hypotheses`); None: the problem's unknowns
+    alone. unknown_noise: estimate the markers' noise of each sample from the residual; what the markers state plays no part then. A
+    registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
+    progress, called with a total and a name. Errors: ValueError as torchrod.estimate.
+    """
+    settings, noise = settings or Settings(), None
+    competing = list(candidates) if candidates is not None else [Hypothesis("", _count(problem), problem.unknowns)]
+    if unknown_noise:
+        kin = [c.unknowns for c in competing if same_kind(c.unknowns, competing[-1].unknowns)]
+        noise, sigma = estimate_noise_among(problem, kin, settings)
+        problem = with_noise(problem, sigma)
+    evidence: Evidence | None = None
+
+    def fitted(problem: Problem) -> tuple[Estimate, Parts]:
+        nonlocal evidence
+        own = [replace(c, unknowns=replace(c.unknowns, registration=problem.unknowns.registration)) for c in competing]
+        if len(own) > 1:
+            found, evidence = select(problem, own, settings, start, bar)
+            return found, parts_of(own, evidence)
+        only = problem.of(own[0].unknowns)
+        with bar(problem.batch, f"{own[0].contacts} contact{'s' * (own[0].contacts != 1)}") as shown:
+            found = estimate_each(only, settings, start(only), shown.update)
+        return found, [(only.unknowns, torch.arange(problem.batch))]
+
+    registration, frame = problem.unknowns.registration, None
+    if registration is not None and registration.scope is Scope.SHARED:
+        with bar(STEPS * problem.batch, "base frame") as shown:
+            shared = with_shared_frame(problem, fitted, settings, shown.update)
+        found, parts, frame, problem = shared.estimate, shared.parts, shared.frame, shared.problem
+    else:
+        found, parts = fitted(problem)
+    if len(parts) == 1:
+        problem = problem.of(parts[0][0])
+    found = found if noise is None else noise.judged(found)
+    return Analysis(problem, found, parts, evidence, noise, frame, diagnose(problem, found, settings, parts))
+
+
+def _count(problem: Problem) -> int:
+    return int(getattr(problem.unknowns.loads, "count", 1))
