@@ -214,8 +214,7 @@ def _that_show_a_load(problem: Problem, candidates: Sequence[Hypothesis]) -> Pro
     loaded = [p for p in problems if p.state.external.stop]
     simplest = min(loaded or problems[:1], key=lambda p: p.state.free_size)
     simplest.check()
-    present = problem.present()
-    return problem.without(~simplest.usable.unsqueeze(-1) & torch.ones_like(present))
+    return problem.without((~simplest.usable).unsqueeze(-1).expand_as(problem.present))
 
 
 def _explains_better(

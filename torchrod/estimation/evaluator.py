@@ -353,10 +353,14 @@ def _layout(problem: Problem, x: Float[Tensor, "B n"] | None = None) -> Layout:
 
 
 def _layout_key(problem: Problem) -> Any:
-    """What a layout depends on, by value."""
-    markers = problem.markers
-    assert markers is not None
-    return key((problem.robot, problem.unknowns, markers.s, markers.offsets, problem.steps))
+    """What a layout depends on, by value; but for the number of steps the same for the coarse problem."""
+    known = vars(problem).get("_known_key")
+    if known is None:
+        markers = problem.markers
+        assert markers is not None
+        known = key((problem.robot, markers.s, markers.offsets))
+        vars(problem)["_known_key"] = vars(problem.coarse)["_known_key"] = known
+    return known, problem.unknowns, problem.steps
 
 
 def _tables(problem: Problem, nu: float, x: Float[Tensor, "B n"] | None, w: Float[Tensor, "B z"]) -> kernel.FitTables:

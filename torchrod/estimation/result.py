@@ -74,7 +74,7 @@ def verdict(
     outlier, chi2 = torch.zeros(problem.batch, problem.group_count, dtype=torch.bool), cost.clone()
     most_inside = read > 0
     if math.isfinite(evaluate.nu):
-        present, groups, m = problem.present(), problem.groups, len(problem.groups)
+        present, groups, m = problem.present, problem.groups, len(problem.groups)
         rows = torch.bincount(groups).tolist()
         square = ekf.by_group((problem.weights * sums.r**2)[:, :m], groups)
         outlier = present & (square > torch.tensor([limit(k) for k in rows], dtype=DTYPE))
@@ -357,7 +357,7 @@ def make_estimate(
         base_wrench=kept(state.base.of(x)),
         registration=kept(state.registration.of(x)) if state.registration.size else None,
         centre_line=kept(sums.line),
-        residual=_only(torch.isfinite(problem.distances(problem.reading)).all(-1))(kept(problem.distances(rows))),
+        residual=_only(problem.distances(problem.weights).amin(-1) > 0)(kept(problem.distances(rows))),
         row_residual=kept(rows),
         tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
         tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,

@@ -230,10 +230,10 @@ class Robust:
 
 @dataclass(frozen=True)
 class Restarts:
-    """The solver's fit, and where it is not accepted the solver again, `hasty`, from its loads times each of the factors."""
+    """The solver's fit, and where it is not accepted a hasty one's from its loads times each of the factors."""
 
     solver: Solver
-    hasty: Solver
+    hasty: Callable[[], Solver]
     factors: tuple[float, ...]
 
     def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
@@ -249,7 +249,7 @@ class Restarts:
                 break
             part = problem.take(index)
             x = in_equilibrium(part, loads.rescaled(fit.x[index][:, at], factor))
-            fit = fit.improved_by(self.hasty(part, Start.at(x, Origin.OTHER_FIT)), index)
+            fit = fit.improved_by(self.hasty()(part, Start.at(x, Origin.OTHER_FIT)), index)
         return fit
 
 
@@ -258,11 +258,11 @@ class Challenged:
     """From a start that costs less than a cold one; where no accepted fit comes of it, all that would come of a cold start."""
 
     solver: Restarts
-    Sigma0: Float[Tensor, "n n"]
+    settings: Settings
 
     def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
         """See Solver."""
-        chosen, dropped = challenged_by_cold(problem, start, self.Sigma0)
+        chosen, dropped = challenged_by_cold(problem, start, self.settings.initial_covariance(start.x))
         fit = self.solver.solver(problem, chosen, progress)
         failed = chosen.challenged & ~fit.accepted & problem.usable
         fate = torch.zeros_like(start.origin)
@@ -275,34 +275,35 @@ class Challenged:
         return self.solver.improve(problem, fit, ~failed)
 
 
-def solver_of(problem: Problem, settings: Settings) -> Solver:
+def solver_of(settings: Settings) -> Solver:
     """The solver that the settings describe: Challenged(Restarts(Robust(Filter)))."""
 
     def base(settings: Settings) -> Solver:
         plain = Filter(settings)
         return plain if math.isinf(settings.robust) else Robust(plain, settings.robust)
 
-    hasty = replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS))
-    restarts = Restarts(base(settings), base(hasty), settings.restarts)
-    return Challenged(restarts, settings.initial_covariance(problem.mean))
+    def hasty() -> Solver:
+        return base(replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS)))
+
+    return Challenged(Restarts(base(settings), hasty, settings.restarts), settings)
 
 
 def estimate_each(
     problem: Problem, settings: Settings | None = None, start: StartRule | Start = cold_start, progress: Progress = silent
 ) -> Estimate:
     """Fit every sample by itself, whatever the scope of its unknowns: see torchrod.estimate, which adds what samples share."""
+    problem = replace(problem)  # of this call: what it works out from tensors must not outlive a change of them
     problem.check()
     if problem.robot.gravity.ndim != 1:
         raise ValueError("an estimate takes one gravity (3,) for all samples; estimate those of each gravity by themselves")
     parts, compiled, B = [], kernel_serves(problem), problem.batch
     size = CHUNK if compiled else CHUNK_TORCH
-    solve = solver_of(problem, settings or Settings())
+    solve = solver_of(settings or Settings())
     # What is kept from call to call, and the answer, must serve outside of inference mode, too.
     with torch.inference_mode(False), one_thread(compiled and B <= FEW):
         for first in range(0, B, size):
             index = torch.arange(first, min(first + size, B))
-            # A problem of its own for each call: what it works out from tensors must not outlive a change of them.
-            chunk = replace(problem) if len(index) == B else problem.take(index)
+            chunk = problem if len(index) == B else problem.take(index)
             parts.append(solve(chunk, _begin(start, chunk, index, B), progress))
     return Estimate.cat(parts)
 

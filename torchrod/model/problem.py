@@ -156,16 +156,17 @@ class Problem(Float64):
         """G."""
         return int(self.groups[-1]) + 1
 
-    def present(self, rows: Bool[Tensor, "B rows"] | None = None) -> Bool[Tensor, "B G"]:
+    @property
+    def present(self) -> Bool[Tensor, "B G"]:
         """Which groups of rows were read, whole or in part."""
-        read = self.weights[:, :-TIP_ROWS] > 0 if rows is None else rows
+        read = self.weights[:, :-TIP_ROWS] > 0
         return torch.zeros(len(read), self.group_count, dtype=torch.int64).index_add(1, self.groups, read.long()) > 0
 
     def distances(self, rows: Float[Tensor, "B rows"]) -> Float[Tensor, "B K 3"]:
         """Those of the sensors' rows that are positions (m)."""
         parts, first = [], 0
         for sensor in self.sensors:
-            last = first + len(sensor.groups)
+            last = first + sensor.rows
             parts.append(sensor.distances(rows[:, first:last]))
             first = last
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)

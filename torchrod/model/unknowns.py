@@ -9,6 +9,7 @@ SHARED has one value for all samples of a problem (estimation.shared); the other
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -111,17 +112,17 @@ class State:
         """How many entries only the sensors determine: not the base wrench, which (17) holds, nor tensions, which have priors."""
         return self.size - self.base.size - self.tension.size
 
-    @property
+    @cached_property
     def informative(self) -> int:
         """How many prior entries count as data in the chi-square test."""
         return sum(block.informative for block in self.blocks)
 
-    @property
+    @cached_property
     def mean(self) -> Float[Tensor, " n"]:
         """The prior mean of x."""
         return torch.cat([block.mean for block in self.blocks])
 
-    @property
+    @cached_property
     def precision(self) -> Float[Tensor, " n"]:
         """The prior precision of every entry of x."""
         return torch.cat([block.precision for block in self.blocks])

@@ -37,6 +37,11 @@ class Markers(Float64):
         return x & y & z
 
     @property
+    def rows(self) -> int:
+        """Three for each marker."""
+        return 3 * len(self.s)
+
+    @property
     def groups(self) -> Int[Tensor, " rows"]:
         """A marker's three rows."""
         return torch.arange(len(self.s)).repeat_interleave(3)

@@ -1,5 +1,6 @@
 """What every sensor supplies, and what it is told of the rod."""
 
+import math
 from dataclasses import dataclass
 from typing import Protocol, Self, runtime_checkable
 
@@ -34,6 +35,11 @@ class Sensor(Protocol):
     @property
     def s(self) -> Float[Tensor, " P"]:
         """The arc lengths (m) at which the sensor needs the rod; none for one that needs the base wrench alone."""
+        ...
+
+    @property
+    def rows(self) -> int:
+        """Numbers of one sample."""
         ...
 
     @property
@@ -94,7 +100,7 @@ def variance(noise: float | Float[Tensor, " B"]) -> float | Float[Tensor, "B 1"]
 
 def check_noise(name: str, noise: float | Tensor, unit: str) -> None:
     """Refuse a standard deviation that is none."""
-    values = torch.as_tensor(noise, dtype=torch.float64)
-    bad = ~((values > 0) & torch.isfinite(values))
-    if bool(bad.any()):
-        raise ValueError(f"{name} is {float(values[bad].flatten()[0]):g} {unit}; it must be positive and finite")
+    values = noise.flatten() if isinstance(noise, Tensor) else None
+    bad = [noise] if values is None else values[~((values > 0) & torch.isfinite(values))].tolist()
+    if (values is None and not 0 < noise < math.inf) or (values is not None and bad):
+        raise ValueError(f"{name} is {float(bad[0]):g} {unit}; it must be positive and finite")
