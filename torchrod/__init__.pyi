@@ -68,6 +68,7 @@ from .model.load_families import PaperCoordinates as PaperCoordinates
 from .model.load_families import PointCoordinates as PointCoordinates
 from .model.problem import Problem as Problem
 from .model.sensors import Markers as Markers
+from .model.sensors import Poses as Poses
 from .model.sensors import Sensor as Sensor
 from .model.unknowns import Registration as Registration
 from .model.unknowns import Scope as Scope

@@ -5,6 +5,7 @@ joins the rows of all its sensors; nothing else knows what a row means.
 """
 
 from .markers import Markers
+from .pose import Poses
 from .sensor import RodState, Sensor
 
-__all__ = ["Markers", "RodState", "Sensor"]
+__all__ = ["Markers", "Poses", "RodState", "Sensor"]
