@@ -67,6 +67,7 @@ from .model.load_families import GaussianCoordinates as GaussianCoordinates
 from .model.load_families import PaperCoordinates as PaperCoordinates
 from .model.load_families import PointCoordinates as PointCoordinates
 from .model.problem import Problem as Problem
+from .model.sensors import BaseWrench as BaseWrench
 from .model.sensors import Markers as Markers
 from .model.sensors import Poses as Poses
 from .model.sensors import Sensor as Sensor

@@ -4,8 +4,9 @@ A sensor says at which arc lengths it sits, what it would read of a rod (`predic
 joins the rows of all its sensors; nothing else knows what a row means.
 """
 
+from .base_wrench import BaseWrench
 from .markers import Markers
 from .pose import Poses
 from .sensor import RodState, Sensor
 
-__all__ = ["Markers", "Poses", "RodState", "Sensor"]
+__all__ = ["BaseWrench", "Markers", "Poses", "RodState", "Sensor"]
