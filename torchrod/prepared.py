@@ -103,7 +103,8 @@ class Layout:
 def _numbers(model: Model) -> dict[str, float]:
     """Units of the entries of x."""
     rod, scaled = model.robot.rod, model.scaled
-    return {
+    sigmoid = {name: getattr(model.coordinates, name, 0.0) for name in ("eps", "beta1", "beta2")}  # of the paper's coordinates
+    return sigmoid | {
         "length": rod.length,
         "force_scale": getattr(model.coordinates, "force_scale", 1.0),
         "force_unit": rod.force_scale if scaled else 1.0,
