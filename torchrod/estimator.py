@@ -24,6 +24,7 @@ CHUNK = 4096  # samples per pass: what is done once per pass and iteration no lo
 FEW = 1024  # samples for which torch's own share is done sooner on one thread
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
+PAPER_GAIN = 1e-3  # of chi^2: what the paper calls converged is not printed
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 
 
@@ -38,6 +39,8 @@ class Settings:
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
+    gain: a sample has converged, too, when the step that the filter takes promises to lower the cost by less than this; 0: only when
+    a full Gauss-Newton step does (torchrod.ekf.Limits).
     """
 
     Sigma0: float | Float[Tensor, " n"] = 1.0
@@ -48,6 +51,7 @@ class Settings:
     max_iterations: int = 100
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
     robust: float = math.inf
+    gain: float = 0.0
 
     def initial_covariance(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "n n"]:
         """Sigma0 as a matrix."""
@@ -63,7 +67,16 @@ def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Setting
     assert isinstance(model.coordinates, PaperCoordinates)
     size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
     size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
-    return Settings(Sigma0 * size**2, Q * size**2, torch.inf, False, False, 500, ())
+    return Settings(
+        Sigma0=Sigma0 * size**2,
+        Q=Q * size**2,
+        step_limit=math.inf,
+        adaptive=False,
+        coarse=False,
+        max_iterations=500,
+        restarts=(),
+        gain=PAPER_GAIN,
+    )
 
 
 @dataclass(frozen=True)
@@ -148,7 +161,7 @@ def _filter(
     status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
     live = ok.nonzero().squeeze(-1)
     sums = Sums.room(len(x), model.size, len(markers.s))
-    limits = ekf.Limits(step=settings.step_limit)
+    limits = ekf.Limits(step=settings.step_limit, gain=settings.gain)
     rough = replace(prepared, model=model.coarse), limits._replace(decrement=NEAR)
     near = torch.full((len(x),), not settings.coarse or model.coarse is model)
     course = _Course((at, Sigma0, Q, sums), rough, (prepared, limits), live, near, settings.max_iterations)

@@ -113,10 +113,12 @@ def _label(fit: Fit, k: int) -> str:
     return f"{float(fit.force[k].norm()):.3g} N at {float(fit.location[k]) * 1e3:.0f} mm"
 
 
-def draw_on(axes: Axes3D, robot: Robot, fit: Fit, markers: Markers, sample: int, truth: Fit | None = None) -> None:
+def draw_on(
+    axes: Axes3D, robot: Robot, fit: Fit, markers: Markers, sample: int, truth: Fit | None = None, true_colour: str = TRUTH
+) -> None:
     """Draw one sample: markers (teal), fitted rod (dark), loads (red), equal axes in metres.
 
-    truth: the true loads where they are known (grey, and in the title).
+    truth: the true loads where they are known (in true_colour, grey by default, and in the title).
     """
     axes.computed_zorder = False  # by depth, the arrow of a good estimate would vanish behind the true one
     tension = None if markers.tension is None else markers.tension[sample]
@@ -134,7 +136,7 @@ def draw_on(axes: Axes3D, robot: Robot, fit: Fit, markers: Markers, sample: int,
     vectors, everything = scene.points - scene.tails, torch.cat([scene.line, seen, scene.tails, scene.envelope])
     if truth is not None:
         true_scene = _scene(robot, truth, tension)
-        _arrows(axes, true_scene, TRUTH, 6.0, "true force", 2)
+        _arrows(axes, true_scene, true_colour, 6.0, "true force", 2)
         everything = torch.cat([everything, true_scene.tails])
         both = [(_label(truth, k), _label(fit, k)) for k in range(min(len(truth.force), len(fit.force)))]
         axes.set_title("\n".join(f"true {a}, estimated {b}" for a, b in both), fontsize=12)

@@ -59,7 +59,7 @@ class Filter(ctypes.Structure):
 
     _fields_ = [
         *((n, _P) for n in ("mean", "precision", "Q")),
-        *((n, _D) for n in ("step", "decrement", "share", "settled")),
+        *((n, _D) for n in ("step", "decrement", "share", "settled", "gain")),
         *((n, _P) for n in ("x", "Sigma", "before", "cap", "Sigma0", "done")),
     ]
 
