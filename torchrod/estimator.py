@@ -11,6 +11,7 @@ from torch import Tensor
 from . import ekf
 from .checks import check, usable
 from .coordinates import PaperCoordinates
+from .errors import InputError
 from .fast import Sums, iterate_all
 from .measurement import Markers, Model
 from .precision import DTYPE
@@ -25,6 +26,8 @@ FEW = 1024  # samples for which torch's own share is done sooner on one thread
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 PAPER_GAIN = 1e-3  # of chi^2: what the paper calls converged is not printed
+PAPER_SIZES, PAPER_ALPHA = (50.0, 50.0, 0.03, 10.0), (3.0, 0.07)  # of [a_x, a_y (N/m), eta, c (1/m^2)] and of [N, N m]
+PAPER_RATIO = 2.0  # square root of Sigma_0 over Q
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 
 
@@ -39,8 +42,8 @@ class Settings:
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
-    gain: a sample has converged, too, when the step that the filter takes promises to lower the cost by less than this; 0: only when
-    a full Gauss-Newton step does (torchrod.ekf.Limits).
+    gain: a sample has converged, too, when the step that the filter takes promises to lower the cost by less than this; 0: only
+    when a full Gauss-Newton step does (torchrod.ekf.Limits).
     """
 
     Sigma0: float | Float[Tensor, " n"] = 1.0
@@ -59,16 +62,19 @@ class Settings:
 
 
 def paper_settings(model: Model, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
-    """The paper's plain recursion: no step limit, no adaptive noise.
+    """The paper's plain recursion (4): no step limit, no adaptive noise, no restart; `model` has PaperCoordinates and alpha in SI.
 
-    Q and Sigma0 multiply the squared sizes of [a_x, a_y, eta, c] and of alpha and zeta. The paper does not print its own; these
-    sizes did best of those tried on Study 1 (docs/model.md).
+    Q and Sigma0 multiply the tuning, which the paper does not print: ours did best of those that scripts/paper_search.py tried,
+    with coordinates that start 6 mm wide and a range of 4 mm beyond the rod, and tip_std = (2e-3 N, 2e-3 N m).
+    Errors: InputError for a model with other coordinates.
     """
-    assert isinstance(model.coordinates, PaperCoordinates)
-    size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(model.coordinates.count)
-    size = torch.cat([size, torch.ones(model.size - len(size), dtype=DTYPE)])
+    if not isinstance(model.coordinates, PaperCoordinates):
+        raise InputError(f"paper_settings: the model has {type(model.coordinates).__name__}; give it PaperCoordinates")
+    size = torch.ones(model.size, dtype=DTYPE)  # square roots of Q's diagonal
+    size[: model.coordinates.size] = torch.tensor(PAPER_SIZES, dtype=DTYPE).repeat(model.coordinates.count)
+    size[-6:-3], size[-3:] = PAPER_ALPHA
     return Settings(
-        Sigma0=Sigma0 * size**2,
+        Sigma0=Sigma0 * PAPER_RATIO**2 * size**2,
         Q=Q * size**2,
         step_limit=math.inf,
         adaptive=False,
@@ -255,7 +261,8 @@ def estimate(
     start: StartRule | Start = cold_start,
     progress: Callable[[int], object] = _silent,
 ) -> Estimate:
-    """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (3), iterated by (4).
+    """Fit loads, registration and base wrench to the markers of every sample: the weighted least squares (1) of the residual (3),
+    iterated by (4).
 
     noise: standard deviation of a marker coordinate (m), where markers.sigma does not have one for each sample.
     start: where to start, or a rule that says so from (model, markers, noise) of some of the samples; a guess that is no nearer to

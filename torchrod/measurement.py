@@ -92,6 +92,8 @@ class Model:
     tension_std: standard deviation (N) of the sensors of the tensions, which are then part of the state; None takes them as exact.
     frame_std: standard deviations (m, rad) of a component of the base frame's error, where they are better known than FRAME_SHIFT
     and FRAME_TURN say.
+    tip_std: standard deviations (N, N m) of a component of the tip residual, W^-1/2 of the paper's W on c; None: TIP_FORCE_STD and
+    TIP_MOMENT_STD in the rod's scales.
     """
 
     robot: Robot
@@ -102,6 +104,7 @@ class Model:
     tip: str = "none"
     tension_std: float | None = None
     frame_std: tuple[float, float] | None = None
+    tip_std: tuple[float, float] | None = None
 
     @cached_property
     def coarse(self) -> "Model":
@@ -250,7 +253,8 @@ class Model:
     def tip_weights(self, like: Tensor) -> Float[Tensor, " 6"]:
         """1 / variance of the tip residual c (1/N^2, 1/(N m)^2): stiff, so that (17) holds to a milli-force-scale."""
         rod = self.robot.rod
-        return like.new_tensor([TIP_FORCE_STD * rod.force_scale] * 3 + [TIP_MOMENT_STD * rod.moment_scale] * 3) ** -2
+        force, moment = self.tip_std or (TIP_FORCE_STD * rod.force_scale, TIP_MOMENT_STD * rod.moment_scale)
+        return like.new_tensor([force] * 3 + [moment] * 3) ** -2
 
     def weights(self, markers: Markers, noise: float) -> Float[Tensor, "B z"]:
         """The diagonal of W: 1 / noise^2 for a marker that was seen, 0 for a missing one, then the tip residual's."""

@@ -130,7 +130,8 @@ def draw_on(
     look = {"color": MARKER, "s": 28, "depthshade": False, "zorder": 6}
     axes.scatter(*seen.T.numpy(), label="markers", **look)  # pyright: ignore[reportArgumentType]
     if scene.loaded.any():
-        axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, zorder=3, label="load per length")
+        envelope = torch.where(scene.loaded.unsqueeze(-1), scene.envelope, torch.nan)  # no line from one load to the next
+        axes.plot(*envelope.T.numpy(), color=LOAD, linewidth=1, zorder=3, label="load per length")
         for i in scene.loaded.nonzero().flatten().tolist():
             axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5, zorder=3)
     vectors, everything = scene.points - scene.tails, torch.cat([scene.line, seen, scene.tails, scene.envelope])

@@ -241,7 +241,8 @@ def _joint_lines(d: dict[str, Any]) -> list[str]:
 def _beam_figure(robot: Robot, path: Path) -> None:
     """Top: the paper's, (7). Bottom: (e) along the rod of the studies."""
     figure = Figure(figsize=(10, 8.4), layout="constrained")
-    top, bottom = figure.subfigures(2, 1)
+    halves = figure.add_gridspec(2, 1, height_ratios=(1, 1))
+    top, bottom = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
     draw_beam(top)
     left, right = bottom.subplots(1, 2)
     a = torch.linspace(0.05, 1, 96, dtype=torch.float64) * L
@@ -263,7 +264,8 @@ def _beam_figure(robot: Robot, path: Path) -> None:
 def _force_figure(c: Curves, path: Path) -> None:
     """Top: the paper's, (8). Bottom: the rod of the studies; rows magnitude and location, columns one at a time and jointly."""
     figure = Figure(figsize=(10, 15.5), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1))
+    halves = figure.add_gridspec(2, 1, height_ratios=(1, 1))
+    top, bottom = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
     draw_rod(top)
     grid = bottom.subplots(2, 2, sharex=True, sharey="row")
     for k, unit in enumerate(("magnitude (N)", "location (mm)")):

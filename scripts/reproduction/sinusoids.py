@@ -35,7 +35,7 @@ GREY, NAVY, RED = "#9a9a9a", "#1b2a41", "#c8102e"
 
 
 def printed_beam() -> Robot:
-    """The beam of the paper's Figures 2 to 4: L = 1 m, EI = 1 N m^2. Ours is a round steel rod, as thick as that takes (3.15 mm)."""
+    """The beam of the paper's Figures 2 to 4: L = 1 m, EI = 1 N m^2; ours is a round steel rod (3.15 mm)."""
     return Robot(Rod.circular(1.0, (64 / (207e9 * math.pi)) ** 0.25, 207e9, 79e9))
 
 
@@ -177,7 +177,8 @@ def _lines(n: Tensor, w: dict[str, Tensor], d: dict[str, float]) -> list[str]:
         "the right one give the same number.",
         "",
         "Bottom, beyond the paper: the rod of the studies, RMS deflection over the rod, per N/m. (5) is printed",
-        f"sqrt(2) A EI / (2 omega^4), with EI = {d['EI_Nm2']:.5f} N m^2 in the numerator; here it is in the denominator. Beside the",
+        f"sqrt(2) A EI / (2 omega^4), with EI = {d['EI_Nm2']:.5f} N m^2 in the numerator; here it is in the denominator. Beside",
+        "the",
         "closed forms of Euler-Bernoulli, the Cosserat solver with a section that neither shears nor",
         f"stretches, A = {1e3 * A:g} mN/m:",
         "",
@@ -198,7 +199,8 @@ def _lines(n: Tensor, w: dict[str, Tensor], d: dict[str, float]) -> list[str]:
 def _figure(n: Tensor, w: dict[str, Tensor], d: dict[str, float], path: Path) -> None:
     """Top: the paper's three panels. Bottom: both supports of the rod of the studies, closed form and solver."""
     figure = Figure(figsize=(11, 8.6), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.35))
+    halves = figure.add_gridspec(2, 1, height_ratios=(1, 1.35))
+    top, bottom = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
     top.suptitle("Paper's Figure 2: simply supported beam, L = 1 m, EI = 1 N m², load A sin(N π s / L), A = 16 π⁴ N/m", fontsize=11)
     panels = top.subplots(1, len(PRINTED_WAVES), sharey=True)
     for axes, m in zip(panels, PRINTED_WAVES, strict=True):

@@ -4,8 +4,8 @@
     (7)  dF/ddelta = 6 EI / (3 L mu^2 - mu^3),            dmu/ddelta = EI / (F (L mu - mu^2 / 2))
     (8)  [d delta; d c] = H [d alpha; d gamma]  ->  J = H12 - H11 H21^+ H22,   [dF/ddelta; dmu/ddelta] = J^+
 
-for a Cosserat rod, gamma = [F, mu], by the blocks of H = dh/dx at the equilibrium. Figure 4 takes (8) one parameter at a time, as (7)
-is: the norm of the pseudo-inverse of one column of J. delta is the position of the tip, or of several points along the rod.
+for a Cosserat rod, gamma = [F, mu], by the blocks of H = dh/dx at the equilibrium. Figure 4 takes (8) one parameter at a time, as
+(7) is: the norm of the pseudo-inverse of one column of J. delta is the position of the tip, or of several points along the rod.
 """
 
 import math
@@ -75,7 +75,9 @@ def tip_figures() -> dict[str, Any]:
     J, small = _by_points(1, weak, mu[0]), torch.stack(beam_by_tip(weak, mu[0]), -1)
     keys = ("alone_magnitude", "alone_location", "joint_magnitude", "joint_location")
     factors = torch.cat([one_at_a_time(J) / small, jointly(J) / small], -1)
-    data: dict[str, Any] = {"at_1_mN": {f"{a:g}": dict(zip(keys, v.tolist(), strict=True)) for a, v in zip(PLACES, factors, strict=True)}}
+    data: dict[str, Any] = {
+        "at_1_mN": {f"{a:g}": dict(zip(keys, v.tolist(), strict=True)) for a, v in zip(PLACES, factors, strict=True)}
+    }
     for k, name in enumerate(NAMES):
         for label, values in (("tip", tip / straight), ("points", many / straight)):
             data[f"{name}_{label}"] = {
@@ -92,12 +94,14 @@ def tip_lines(d: dict[str, Any]) -> list[str]:
         "",
         "![Top: (7) over force and location. Bottom: the same over the whole shape of the rod of the studies](figure3.png)",
         "",
-        "One point force F at mu, L = 1 m, EI = 1 N m^2. Top of figure 3: (7), from the deflection of the tip alone, one parameter at",
+        "One point force F at mu, L = 1 m, EI = 1 N m^2. Top of figure 3: (7), from the deflection of the tip alone, one",
+        "parameter at",
         "a time. dF/ddelta depends on mu only; dmu/ddelta falls like 1/F.",
         "",
         "![Top: (8) over force and location, and over the force. Bottom: the rod of the studies](figure4.png)",
         "",
-        "Top of figure 4: (8) for the Cosserat rod, by the blocks of H and their pseudo-inverses, with the force fixed in the section",
+        "Top of figure 4: (8) for the Cosserat rod, by the blocks of H and their pseudo-inverses, with the force fixed in the",
+        "section",
         f"as in (9). At 1 mN it meets (7) within {100 * off:.2f} %. The factor by which it exceeds (7), from the tip:",
         "",
     ]
@@ -112,8 +116,10 @@ def tip_lines(d: dict[str, Any]) -> list[str]:
         "dmu/ddelta itself falls with the force while the rod is nearly straight, and rises where the factor grows faster than the",
         "force (near the tip beyond 3 N).",
         f"With {POINTS} points along the rod instead of the tip, both are smaller: at 0.95 m and 0.1 N {few[0]['0.1']:.2f} and",
-        f"{few[1]['0.1']:.2f} of (7), at 8 N {few[0]['8']:.2f} and {few[1]['8']:.2f}. More points lower the uncertainty; it rises with",
-        "the force all the same. (7) and (8) agree one parameter at a time only: the rows of the pseudo-inverse of both columns of J",
+        f"{few[1]['0.1']:.2f} of (7), at 8 N {few[0]['8']:.2f} and {few[1]['8']:.2f}. More points lower the uncertainty; it",
+        "rises with",
+        "the force all the same. (7) and (8) agree one parameter at a time only: the rows of the pseudo-inverse of both",
+        "columns of J",
         f"differ from (7) even at 1 mN, for the magnitude by a factor of {min(joint):.1g} to {max(joint):.1g}.",
         "",
     ]
@@ -134,7 +140,8 @@ def _map(figure: SubFigure, axes: Axes, F: Tensor, mu: Tensor, values: Tensor, n
 
 def _mesh() -> tuple[Tensor, Tensor]:
     F, mu = torch.linspace(0.1, MOST, GRID, dtype=torch.float64), torch.linspace(0.1, 0.99, GRID, dtype=torch.float64)
-    return torch.meshgrid(F, mu, indexing="ij")
+    F, mu = torch.meshgrid(F, mu, indexing="ij")
+    return F, mu
 
 
 def draw_beam(figure: SubFigure) -> None:
@@ -158,7 +165,7 @@ def draw_rod(figure: SubFigure) -> None:
     for k, name in enumerate(NAMES):
         _map(figure, grid[0, k], F, mu, both[..., k], name)
         axes = grid[1, k]
-        for j, (a, colour) in enumerate(zip(PLACES, COLOURS, strict=True)):
+        for j, colour in enumerate(COLOURS):
             for style, values in curves.items():
                 axes.loglog(force, values[:, j, k], style, color=colour, lw=0.8 if style == "--" else 1.5)
         axes.set_xlabel("force F (N)")

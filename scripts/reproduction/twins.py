@@ -1,14 +1,14 @@
 """Digital twins of the paper's two tendon robots: displaced tendons, pushes, noisy markers on the discs, a model a little wrong.
 
-1-DoF robot (Tables I and II, whose loads sit within its 40 cm): 1.4 mm ASTM A228, a tendon parallel at 7 mm to the last disc, discs 5 cm
-apart, 0.144 kg/m. 2-DoF robot (Table III): 56 cm, tendons parallel at 25 mm on orthogonal sides, one to the tip, the other to the
-disc halfway, discs 7 cm apart, 0.252 kg/m. Nine discs so far apart fill either robot from base to tip, so the nine markers sit at
-0, 1/8, ..., 1 of the length; the one on the base disc tells nothing of the load.
+1-DoF robot (Tables I and II, whose loads sit within its 40 cm): 1.4 mm ASTM A228, a tendon parallel at 7 mm to the last disc, discs
+5 cm apart, 0.144 kg/m. 2-DoF robot (Table III): 56 cm, tendons parallel at 25 mm on orthogonal sides, one to the tip, the other to
+the disc halfway, discs 7 cm apart, 0.252 kg/m. Nine discs so far apart fill either robot from base to tip, so the nine markers sit
+at 0, 1/8, ..., 1 of the length; the one on the base disc tells nothing of the load.
 
-Not printed, and our choice: gravity along +x, the gravity plane's tendon below the rod (at +x, so that pulling adds to the sag), the
-other at +y; in-plane loads hang along +x, out-of-plane ones pull along +y, those of Table III half way between; 0.25 mm of marker
-noise; the 2-DoF backbone's diameter (DIAMETER). With the gravity plane's tendon above, loads of Table II that hang down need 50 to
-80 N of tension; the robot under that tension without load, where a cold start begins, is curled up, and no fit comes of it.
+Not printed, and our choice: gravity along +x, the gravity plane's tendon below the rod (at +x, so that pulling adds to the sag),
+the other at +y; in-plane loads hang along +x, out-of-plane ones pull along +y, those of Table III half way between; 0.25 mm of
+marker noise; the 2-DoF backbone's diameter (DIAMETER). With the gravity plane's tendon above, loads of Table II that hang down need
+50 to 80 N of tension. Under it, without load, the robot is curled up: a cold start begins there, and no fit comes of it.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ MISMATCH = 0.03  # one standard deviation of stiffness, mass and tension, relati
 TENSION_STD = 1.0  # N: what the estimator is told of the errors of the tension readings
 GRAVITY = (9.81, 0.0, 0.0)  # m/s^2: the robots lie across it
 # m, of the 2-DoF robot's backbone. Steel of 2.5 mm weighs 0.039 of the 0.252 kg/m and leaves 13 g for each disc (6 g on the 1-DoF
-# robot, whose tendon runs at 7 mm instead of 25). The largest stroke, 30 mm, turns the tip by 69 degrees and takes 34 N (x EI / r^2 L);
-# with 2 mm the weight alone would turn it by 25 degrees, with 3.5 mm the stroke would take 130 N.
+# robot, whose tendon runs at 7 mm instead of 25). The largest stroke, 30 mm, turns the tip by 69 degrees and takes 34 N (x EI /
+# r^2 L); with 2 mm the weight alone would turn it by 25 degrees, with 3.5 mm the stroke would take 130 N.
 DIAMETER = 2.5e-3
 
 
@@ -74,7 +74,9 @@ class Twin:
     def estimate(self) -> Estimate:
         """As many contacts as there are, gravity and tensions known, registration perfect; NaN markers where there is no shape."""
         rod = self.robot.rod
-        model = Model(self.robot, GaussianCoordinates(self.location.shape[1], rod.length, rod.force_scale, "point"), tension_std=TENSION_STD)
+        model = Model(
+            self.robot, GaussianCoordinates(self.location.shape[1], rod.length, rod.force_scale, "point"), tension_std=TENSION_STD
+        )
         return estimate(model, self.told, NOISE)
 
 

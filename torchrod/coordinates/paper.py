@@ -29,7 +29,7 @@ class PaperCoordinates:
 
     count: int
     length: float
-    width: float = 0.02
+    width: float = 0.006
     eps: float = 1.0
     beta1: float = 0.0
     beta2: float | None = None
