@@ -65,7 +65,7 @@ def paper_lines(
         "promises to",
         "lower chi^2 by less than 0.001; strict: by less than 0.00001; Gauss-Newton: an undamped step would lower it by less",
         "than 0.001,",
-        "which c hardly ever allows, because it may have no minimum.",
+        "which c rarely allows with noise: it may have no minimum.",
         "",
         "| noise | criterion | converged within 500 | accepted | iterations | location, mean (mm) | force, mean (N) |",
         "|---|---|---|---|---|---|---|",
