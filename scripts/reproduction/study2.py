@@ -178,16 +178,16 @@ def _verdict(data: dict[str, Any]) -> list[str]:
     settings = {
         "without noise": lambda name: data[name]["clean"],
         "with noise": lambda name: data[name]["noise_1mm"],
-        "without noise and regularization": lambda name: data[name]["unregularized"]["clean"],
-        "with noise, without regularization": lambda name: data[name]["unregularized"]["noise_1mm"],
+        "unregularized without noise": lambda name: data[name]["unregularized"]["clean"],
+        "unregularized with noise": lambda name: data[name]["unregularized"]["noise_1mm"],
     }
     words = []
     for better, worse in (("gaussian", "point"), ("gaussian", "fourier"), ("point", "fourier")):
         where = [name for name, of in settings.items() if _ahead(of(better), of(worse))]
-        words.append(f"{NAMES[better]} before {NAMES[worse]} {'; '.join(where) if where else 'nowhere'}")
+        words.append(f"{NAMES[better]} before {NAMES[worse]} {' and '.join(where) or 'nowhere'}")
     return [
-        "The paper ranks Gaussians before points before Fourier, in convergence and in shape. Our estimator confirms: "
-        + ". ".join(words)
+        "The paper ranks Gaussians before points before Fourier, in convergence and in shape. Our estimator confirms "
+        + "; ".join(words)
         + ".",
         "",
         "Why: each family has 12 to 14 numbers, enough to follow 20 markers under any such load to micrometres, because the shape "
