@@ -7,6 +7,7 @@ or partial one, so that it does not take the full page's place.
 
 import argparse
 import json
+import textwrap
 from pathlib import Path
 
 from reproduction import coverage, errata, sensitivity, sinusoids, study1, study2, tables
@@ -28,6 +29,15 @@ Made by `python scripts/reproduce.py`. The paper's studies beside ours; every ro
 """
 
 
+def filled(text: str) -> str:
+    """Paragraphs at the page's width; tables, headings and pictures as they are."""
+    blocks = []
+    for block in text.split("\n\n"):
+        prose = block.strip() and not block.lstrip().startswith(("|", "#", "!["))
+        blocks.append(textwrap.fill(block, 120, break_long_words=False, break_on_hyphens=False) if prose else block)
+    return "\n\n".join(blocks)
+
+
 def main() -> None:
     """Run the named parts, or all, and write what they found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -44,7 +54,7 @@ def main() -> None:
         print(f"{name} ...", flush=True)
         data[name], lines = PARTS[name].run(options.quick, options.out)
         page += lines
-        text = "\n".join([HEAD, *summary(data), *page])
+        text = filled("\n".join([HEAD, *summary(data), *page]))
         (options.out / "reproduction.md").write_text(text, encoding="utf-8")
         if options.json:
             options.json.write_text(json.dumps(data, indent=1), encoding="utf-8")

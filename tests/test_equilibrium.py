@@ -59,7 +59,7 @@ def test_it_is_the_forward_solve(robot, kind, compiled, monkeypatch):
     coordinates = {
         "one gaussian": GaussianCoordinates(1, 0.4, f),
         "two gaussians": GaussianCoordinates(2, 0.4, f),
-        "the paper's": PaperCoordinates(1, 0.4),
+        "the paper's": PaperCoordinates(1, 0.4, 0.02, eps=0.3, beta1=-0.01, beta2=0.43),
         "point": PointCoordinates(1, 0.4, f),
     }[kind]
     model, markers, gamma = case(r, coordinates)

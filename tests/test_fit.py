@@ -48,7 +48,7 @@ FAMILIES = {
     "one gaussian": lambda f: GaussianCoordinates(1, 0.4, f),
     "three gaussians": lambda f: GaussianCoordinates(3, 0.4, f, "distributed"),
     "gaussians at known places": lambda f: GaussianCoordinates(2, 0.4, f, locations=(0.1, 0.3)),
-    "the paper's": lambda _: PaperCoordinates(2, 0.4),
+    "the paper's": lambda _: PaperCoordinates(2, 0.4, 0.02, eps=0.3, beta1=-0.01, beta2=0.43),
     "fourier": lambda f: FourierCoordinates(2, 0.4, f),
     "points at known places": lambda f: PointCoordinates(2, 0.4, f, (0.13, 0.3)),
     "points": lambda f: PointCoordinates(2, 0.4, f),

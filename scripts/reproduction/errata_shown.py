@@ -5,16 +5,18 @@ import math
 import torch
 
 from torchrod import (
-    FourierCoordinates,
     GaussianCoordinates,
+    Markers,
     Model,
     PaperCoordinates,
+    PointForces,
     Robot,
     Rod,
     Settings,
     Tendon,
     Tendons,
     estimate,
+    load_bound,
     paper_settings,
     solve_shape,
 )
@@ -22,16 +24,16 @@ from torchrod.estimation import filter as ekf
 from torchrod.estimation.solve import cold_start, linearize
 from torchrod.mechanics.lie import rotate
 
-from .cases import L, S, Study, steel_rod
+from .cases import L, S, Study, steel_rod, study1
+from .paper_mode import paper_model
 
 OFFSET = 0.007  # m, of the tendon of the one-tendon robot (tests/data/shape_reference.json)
 PULLED = {"cm": 0.115, "mm": 0.0115}  # m of tendon: the largest actuation of the tables, read as cm and as mm
 CASE = 11  # of Study 1: the paper's own recursion converges on it
-CHOICES = {  # which Sigma_bar the gain and the covariance update take: 0 this step's, -1 the step before's
-    "both this step's (right)": (0, 0),
-    "gain the one before": (-1, 0),
-    "covariance the one before": (0, -1),
-    "both the one before": (-1, -1),
+CHOICES = {  # which Sigma_bar stands in front of H^T in the gain, and inside it: 0 this step's, -1 the step before's
+    "i in front, i inside (right)": (0, 0),
+    "i - 1 in front, i inside (printed)": (-1, 0),
+    "i - 1 in front, i - 1 inside": (-1, -1),
 }
 
 
@@ -57,8 +59,8 @@ def shape_innovation(study: Study, paper: bool, iterations: int) -> dict[str, li
 
     paper: gamma = [a, eta, c] and the plain recursion; otherwise our coordinates with steps of at most 0.6.
     """
-    coordinates = PaperCoordinates(1, L) if paper else GaussianCoordinates(1, L, study.robot.rod.force_scale)
-    model = Model(study.robot, coordinates, scaled=not paper)
+    ours = Model(study.robot, GaussianCoordinates(1, L, study.robot.rod.force_scale))
+    model = paper_model(study.robot) if paper else ours
     settings = paper_settings(model) if paper else Settings()
     markers = study.noisy(0.0, 1).take(torch.tensor([CASE]))
     w, one, prior = model.weights(markers, 1e-3), torch.ones(model.size, dtype=torch.float64), model.prior()
@@ -77,19 +79,22 @@ def shape_innovation(study: Study, paper: bool, iterations: int) -> dict[str, li
 
 
 def index_choices() -> dict[str, float]:
-    """|x - batch least squares| after 8 data, one at a time, 3 unknowns at rest (Q = 0), for every choice of Sigma_bar in (4)."""
+    """|x - batch least squares| after 8 data, one at a time, 3 unknowns at rest (Q = 0), for choices of Sigma_bar in the gain of
+    (4).
+
+    The covariance update takes Sigma_bar_i, as printed and as is right; the prior stands in for the one before the first.
+    """
     generator = torch.Generator().manual_seed(1)
     H, z = torch.randn(8, 3, generator=generator, dtype=torch.float64), torch.randn(8, generator=generator, dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)
     batch = torch.linalg.solve(eye + H.T @ H, H.T @ z)  # prior x = 0 +- 1, unit noise
     off = {}
-    for name, (of_gain, of_covariance) in CHOICES.items():
+    for name, (front, inside) in CHOICES.items():
         x, Sigma, predicted = torch.zeros(3, dtype=torch.float64), eye, [eye]
         for h, value in zip(H, z, strict=True):
             predicted.append(Sigma)
-            P, P2 = predicted[-1 + of_gain], predicted[-1 + of_covariance]
-            K = P @ h / (h @ P @ h + 1)
-            x, Sigma = x + K * (value - h @ x), P2 - torch.outer(K, h @ P2)
+            K = predicted[-1 + front] @ h / (h @ predicted[-1 + inside] @ h + 1)
+            x, Sigma = x + K * (value - h @ x), predicted[-1] - torch.outer(K, h @ predicted[-1])
         off[name] = float((x - batch).norm())
     return off
 
@@ -109,6 +114,18 @@ def damping(study: Study, powers: tuple[float, ...], count: int) -> dict[str, di
             "iterations": float(fit.iterations.double().mean()),
             "converged": float((fit.status == 0).double().mean()),
         }
+    return rows
+
+
+def undamped(study: Study, powers: tuple[float, ...]) -> dict[str, dict[str, float]]:
+    """Per Q, in our coordinates without step limit and adaptive noise: share converged and their mean iterations (at most 500)."""
+    model = Model(study.robot, GaussianCoordinates(1, L, study.robot.rod.force_scale))
+    rows = {}
+    for Q in powers:
+        settings = Settings(1.0, Q, step_limit=math.inf, adaptive=False, coarse=False, max_iterations=500, restarts=())
+        fit = estimate(model, study.noisy(0.0, 1), 1e-3, settings)
+        done = fit.status == 0
+        rows[f"{Q:g}"] = {"iterations": float(fit.iterations[done].double().mean()), "converged": float(done.double().mean())}
     return rows
 
 
@@ -148,26 +165,24 @@ def actuation() -> dict[str, dict[str, float]]:
     return {unit: {k: float(c[i]) for k, c in zip(keys, columns, strict=True)} for i, unit in enumerate(PULLED)}
 
 
-def counts() -> dict[str, float]:
-    """Parameters of the Fourier series with three periods, and of its sums read otherwise; rank of the sums from k = 0."""
-    s = torch.linspace(0, L, 200, dtype=torch.float64)
-    k = torch.arange(4, dtype=torch.float64)
-    waves = 2 * math.pi * k * s.unsqueeze(-1) / L
-    both = torch.cat([torch.cos(waves), torch.sin(waves)], -1)
-    cosine_from_0 = torch.cat([torch.cos(waves), torch.sin(waves[:, 1:])], -1)
-    from_1 = torch.cat([torch.cos(waves[:, 1:]), torch.sin(waves[:, 1:])], -1)
-    miss = torch.ones_like(s) - from_1 @ torch.linalg.lstsq(from_1, torch.ones_like(s).unsqueeze(-1)).solution[:, 0]
-    return {
-        "size": FourierCoordinates(3, L, 1.0).size,
-        "both_from_0": 2 * both.shape[1],
-        "both_from_0_rank": 2 * int(torch.linalg.matrix_rank(both)),
-        "cosine_from_0": 2 * cosine_from_0.shape[1],
-        "cosine_from_0_rank": 2 * int(torch.linalg.matrix_rank(cosine_from_0)),
-        "both_from_1": 2 * from_1.shape[1],
-        "uniform_missed_without_constant": float(miss.square().mean().sqrt()),
-        "three_gaussians": PaperCoordinates(3, L).size,
-        "gaussians_k_0_to_3": PaperCoordinates(4, L).size,
-    }
+def counts() -> dict[str, int]:
+    """Parameters of three Gaussians by (12), and of the sum of (10) from k = 0 to 3."""
+    return {"three_gaussians": PaperCoordinates(3, L).size, "gaussians_k_0_to_3": PaperCoordinates(4, L).size}
+
+
+def points() -> dict[str, float]:
+    """Discs 5 cm apart on 40 cm, base disc included; standard deviation of a push's location (m) from all of them and from those
+    off the base, for a case of Study 1's rod, 1 mm noise.
+    """
+    study = study1(1, 5)
+    s = torch.arange(9, dtype=torch.float64) * 0.05
+    load = PointForces(torch.nn.functional.pad(study.force, (0, 1)).unsqueeze(1), study.location.unsqueeze(1))
+    found = {"discs": float(len(s)), "length_m": float(s[-1]), "location_m": float(study.location[0])}
+    for name, places in (("nine", s), ("eight", s[1:])):
+        shape = solve_shape(study.robot, (load,), None, places, 1)
+        bound = load_bound(study.robot, Markers(places, shape.p), study.force, study.location, study.base_wrench, 1e-3)
+        found[f"location_std_{name}_m"] = float(bound[0])
+    return found
 
 
 def over_the_tip(sigma: float = 0.01) -> dict[str, dict[str, float]]:

@@ -1,9 +1,10 @@
-"""Figures 3 and 4, (6)-(8): how well a shape error of 1 mm pins down one point force, F (N) at s = a.
+"""Figures 3 and 4, (6)-(8): how well a shape pins down one point force, F (N) at s = a, the paper's mu.
 
-The clamped rod under a force F normal to it at a. "A shape error of 1 mm" is an error of the curve p(s) whose root mean square
-over the rod is 1 mm; |.| below is that root mean square.
+The paper's own figures are in tip_sensitivity.py. Here is what we found beyond them, on the rod of the studies, clamped, under a
+force F normal to it at a. "A shape error of 1 mm" is an error of the curve p(s) whose root mean square over the rod is 1 mm; |.|
+below is that root mean square.
 
-Euler-Bernoulli, our (6)-(7):
+Euler-Bernoulli, as (6) and (7) but over the whole rod:
     (a)  w = F s^2 (3 a - s) / (6 EI) for s <= a,   F a^2 (3 s - a) / (6 EI) beyond
     (b)  dw/dF = w / F;   dw/da = F s^2 / (2 EI) for s <= a,   F a (2 s - a) / (2 EI) beyond
     (c)  |dw/dF|^2 = (1/L) a^4 / (36 EI^2) [33 a^3 / 35 + ((3 L - a)^3 - 8 a^3) / 9]
@@ -11,9 +12,9 @@ Euler-Bernoulli, our (6)-(7):
          by int_0^a s^4 (3 a - s)^2 = 33 a^7 / 35, int_a^L (3 s - a)^2 = ((3 L - a)^3 - 8 a^3) / 9 and the like
     (e)  sensitivities: dF = 1 mm / |dw/dF|, free of F;  da = 1 mm / |dw/da|, like 1 / F
 
-Cosserat, our (8). The model gives h = [p, c] as a function of gamma = (F, a) and the base wrench alpha; in equilibrium the tip
-residual stays zero, c_gamma dgamma + c_alpha dalpha = 0, hence the Jacobian of the forward solve
-    (f)  J = p_gamma - p_alpha c_alpha^-1 c_gamma,   rows weighted so that |J x|^2 is the mean over the rod
+Cosserat, as (8). The model gives h = [p, c] as a function of gamma = (F, a) and the base wrench alpha; in equilibrium the tip
+residual stays zero, H21 dalpha + H22 dgamma = 0, hence the Jacobian of the forward solve, which (8) inverts,
+    (f)  J = H12 - H11 H21^+ H22,   here with rows weighted so that |J x|^2 is the mean over the rod
     (g)  one parameter at a time: 1 mm / (norm of its column), which is (e) where the rod is straight
     (h)  both unknown: J^+ = (J^T J)^-1 J^T, and 1 mm x the norms of its two rows, sqrt(diag (J^T J)^-1). A shape error of 1 mm
          moves a parameter by that much at worst; with independent errors of the points it is their standard deviation, up to one
@@ -30,9 +31,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from torchrod import Markers, Model, PointCoordinates, PointForces, PointWrenches, Robot, solve_shape
+from torchrod import PointForces, PointWrenches, Robot, solve_shape
 
 from .cases import L, steel_rod
+from .tip_sensitivity import draw_beam, draw_rod, equilibrium_jacobian, tip_figures, tip_lines
 
 POINTS = 40
 S = (torch.arange(POINTS, dtype=torch.float64) + 0.5) * L / POINTS  # midpoint rule: every point stands for the same length
@@ -52,17 +54,7 @@ def beam(EI: float, F: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
 
 def jacobian(robot: Robot, F: Tensor, a: Tensor) -> Tensor:
     """(f) for forces F (B,) along the section's x at a (B,): (B, 3 POINTS, 2) in m/N and m/m, rows weighted."""
-    scale = robot.rod.force_scale
-    model = Model(robot, PointCoordinates(1, L, scale), scaled=False, steps=POINTS)
-    load = PointForces(torch.nn.functional.pad(F[:, None, None], (0, 2)), a.unsqueeze(-1))
-    shape = solve_shape(robot, (load,), None, S, len(F), POINTS)
-    gamma = torch.stack([F / scale, 0 * F, torch.logit(a / L)], -1)
-    _, H = model.linearized(model.join(gamma, shape.base_wrench), Markers(S, shape.p))
-    p, c = H[:, :-6], H[:, -6:]
-    J = p[..., :3] - p[..., 3:] @ torch.linalg.solve(c[..., 3:], c[..., :3])
-    # From (F / scale, eta) to (F, a): da/deta = a (1 - a / L).
-    chain = torch.stack([torch.full_like(F, 1 / scale), 1 / (a * (1 - a / L))], -1).unsqueeze(1)
-    return J[..., [0, 2]] * chain / POINTS**0.5
+    return equilibrium_jacobian(robot, F, a, S) / POINTS**0.5
 
 
 def dead_jacobian(robot: Robot, F: Tensor) -> Tensor:
@@ -168,6 +160,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
         data[f"joint_location_factor_{short}"] = _by_place(c.jointly[frame][..., 1] / c.alone[frame][..., 1])
     F = torch.tensor(FORCES, dtype=torch.float64)
     data["tip_turn_deg"] = _by_place(torch.stack([tip_turn(robot, F, torch.full_like(F, a)) for a in PLACES]))
+    data["tip"] = tip_figures()
     data["beam_magnitude_N"] = {f"{a:g}": float(v) for a, v in zip(PLACES, c.beam[:, 0, 0], strict=True)}
     data["beam_location_m_at_1_N"] = {f"{a:g}": float(v) for a, v in zip(PLACES, c.beam[:, 1, 1], strict=True)}
     _beam_figure(robot, folder / "figure3.png")
@@ -198,14 +191,12 @@ def _lines(d: dict[str, Any]) -> list[str]:
         for a, F in d["beam_magnitude_N"].items()
     )
     return [
-        "## Figures 3 and 4, (6)-(8): sensitivity",
+        *tip_lines(d["tip"]),
+        "### Beyond the paper: the whole shape, on the rod of the studies",
         "",
-        "One point force F at s = a on the rod of the studies. The paper's text is not in this repository; we read (6)-(7) as:",
-        "by how much must F, or a, change to move the Euler-Bernoulli cantilever by 1 mm (root mean square over the rod)? And",
-        "(8) as the same from the Jacobian of the Cosserat rod. Euler-Bernoulli, the magnitude, and the location at 1 N:",
+        "By how much must F, or a, change to move the cantilever by 1 mm (root mean square over the rod, not at the tip alone)?",
+        "Lower halves of figures 3 and 4. Euler-Bernoulli, the magnitude, and the location at 1 N:",
         f"{straight}. The location's falls like 1/F.",
-        "",
-        "![Euler-Bernoulli: error of magnitude and of location that 1 mm of shape error means, along the rod](figure3.png)",
         "",
         f"Cosserat, one parameter at a time: at 1 mN it meets Euler-Bernoulli within {100 * d['small_force_off']:.3f} %. The",
         "factor by which the error of the MAGNITUDE exceeds Euler-Bernoulli's, force fixed in the section / in the base frame:",
@@ -244,15 +235,16 @@ def _joint_lines(d: dict[str, Any]) -> list[str]:
         f"{1e3 * u['minimum_norm_N_m_location_m']:.2f} mm in (N, m), {1e3 * u['minimum_norm_N_mm_force_N']:.2f} mN and",
         f"{1e3 * u['minimum_norm_N_mm_location_m']:.5f} mm in (N, mm).",
         "",
-        "![Cosserat against Euler-Bernoulli over the force, one parameter at a time and jointly](figure4.png)",
-        "",
     ]
 
 
 def _beam_figure(robot: Robot, path: Path) -> None:
-    """(e) along the rod."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    """Top: the paper's, (7). Bottom: (e) along the rod of the studies."""
+    figure = Figure(figsize=(10, 8.4), layout="constrained")
+    halves = figure.add_gridspec(2, 1, height_ratios=(1, 1))
+    top, bottom = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    draw_beam(top)
+    left, right = bottom.subplots(1, 2)
     a = torch.linspace(0.05, 1, 96, dtype=torch.float64) * L
     for F, colour in zip((0.1, 1.0, 10.0), COLOURS, strict=False):
         _, location = beam(robot.rod.bending_stiffness, a.new_tensor(F), a)
@@ -265,14 +257,17 @@ def _beam_figure(robot: Robot, path: Path) -> None:
         axes.set_xlabel("location a of the force (mm)")
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=8)
-    figure.suptitle("Euler-Bernoulli cantilever, 400 mm: what a shape error of 1 mm RMS means, one parameter unknown", fontsize=10)
-    figure.savefig(path, dpi=150)
+    bottom.suptitle("Beyond the paper: rod of the studies (400 mm), what a shape error of 1 mm RMS over the rod means", fontsize=11)
+    figure.savefig(path, dpi=120)
 
 
 def _force_figure(c: Curves, path: Path) -> None:
-    """Rows: magnitude, location. Columns: one at a time, jointly."""
-    figure = Figure(figsize=(10, 7.6), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True, sharey="row")
+    """Top: the paper's, (8). Bottom: the rod of the studies; rows magnitude and location, columns one at a time and jointly."""
+    figure = Figure(figsize=(10, 15.5), layout="constrained")
+    halves = figure.add_gridspec(2, 1, height_ratios=(1, 1))
+    top, bottom = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    draw_rod(top)
+    grid = bottom.subplots(2, 2, sharex=True, sharey="row")
     for k, unit in enumerate(("magnitude (N)", "location (mm)")):
         for column, (values, title) in enumerate(((c.alone, "the other parameter known"), (c.jointly, "both unknown"))):
             _draw(grid[k, column], c, {frame: v[..., k] * (1, 1e3)[k] for frame, v in values.items()}, c.beam[..., k] * (1, 1e3)[k])
@@ -283,9 +278,9 @@ def _force_figure(c: Curves, path: Path) -> None:
     places = [Line2D([], [], color=colour, label=f"a = {1e3 * a:.0f} mm") for a, colour in zip(PLACES, COLOURS, strict=True)]
     styles = [Line2D([], [], color="black", ls=ls, label=f"Cosserat, force fixed in the {frame}") for frame, ls in FRAMES.items()]
     styles += [Line2D([], [], color="black", ls="--", lw=0.8, label="Euler-Bernoulli, other parameter known")]
-    figure.legend(handles=places + styles, loc="outside lower center", ncols=4, fontsize=8)
-    figure.suptitle("What a shape error of 1 mm RMS means, by the force that bends the rod", fontsize=11)
-    figure.savefig(path, dpi=150)
+    bottom.legend(handles=places + styles, loc="outside lower center", ncols=4, fontsize=8)
+    bottom.suptitle("Beyond the paper: rod of the studies (400 mm), what a shape error of 1 mm RMS over the rod means", fontsize=11)
+    figure.savefig(path, dpi=100)
 
 
 def _draw(axes: Axes, c: Curves, values: dict[str, Tensor], straight: Tensor) -> None:

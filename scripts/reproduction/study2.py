@@ -28,13 +28,16 @@ from torchrod import (
 from .cases import L, S, steel_rod
 
 NOISE, CLEAN_SIGMA = 1e-3, 1e-4
-AMPLITUDE = 2.0  # N/m: the tip then moves by 80 mm on average
+DEGREE, LIMIT = 10, 5.0  # of the polynomials; N/m, below which |f| stays everywhere
+PAPER = {"gaussian": (0.99, 0.66e-3), "point": (0.93, 1.4e-3), "fourier": (0.92, 4.1e-3)}  # converged, mean RMS shape error (m)
 WEAK = 10.0  # the standard deviation of a coefficient that only keeps the state finite
 COLOURS = {"gaussian": "#c8102e", "fourier": "#0a7f8c", "point": "#d98c00"}
+NAMES = {"gaussian": "Gaussians", "fourier": "Fourier", "point": "points"}
 LABELS = {"gaussian": "3 Gaussians (12)", "fourier": "Fourier, 0-3 periods (14)", "point": "4 point loads (12)"}
-# Point loads at unknown places move the nodes of the integration, which only the torch path can differentiate: slow, so they are
-# tried once, and given up where the others would have settled.
-IMPATIENT = Settings(max_iterations=60, restarts=())
+ITERATIONS = 500  # as the paper allows
+POINT = Settings(
+    max_iterations=ITERATIONS, restarts=()
+)  # tried once: few of the many minima of four points are better for a restart
 
 
 @dataclass(frozen=True)
@@ -56,13 +59,26 @@ class Study2:
 
 
 def study2(count: int, seed: int = 0) -> Study2:
-    """Random cubic loads: f_x and f_y uniform in +-AMPLITUDE at s = 0, L/3, 2L/3 and L."""
+    """Two polynomials of degree 10 in s a case, for local x and y: Chebyshev coefficients uniform in +-1 (T_0 to T_10 over the
+    rod, so that no part of the rod is preferred), scaled so that the largest |f| on the rod is uniform in half of LIMIT to LIMIT.
+    """
     generator = torch.Generator().manual_seed(seed)
-    values = AMPLITUDE * (2 * torch.rand(count, 2, 4, generator=generator, dtype=torch.float64) - 1)
-    powers = torch.linspace(0, 1, 4, dtype=torch.float64).unsqueeze(-1) ** torch.arange(4)
-    load = PolynomialLoads(torch.linalg.solve(powers, values.unsqueeze(-1)).squeeze(-1), L)
+    chebyshev = 2 * torch.rand(count, 2, DEGREE + 1, generator=generator, dtype=torch.float64) - 1
+    load = PolynomialLoads(chebyshev @ powers_of_chebyshev(DEGREE), L)
+    top = load.density(torch.linspace(0, L, 1001, dtype=torch.float64)).norm(dim=-1).amax(-1)
+    size = LIMIT * (0.5 + 0.5 * torch.rand(count, generator=generator, dtype=torch.float64)) / top
+    load = PolynomialLoads(size[:, None, None] * load.coefficients, L)
     robot = steel_rod()
     return Study2(robot, load, solve_shape(robot, (load,), None, S, count, 160).p)
+
+
+def powers_of_chebyshev(degree: int) -> Tensor:
+    """Row k: the coefficients of T_k(2 t - 1) in powers of t."""
+    rows = [torch.zeros(degree + 1, dtype=torch.float64) for _ in range(degree + 1)]
+    rows[0][0], rows[1][:2] = 1.0, torch.tensor([-1.0, 2.0])
+    for k in range(2, degree + 1):  # T_k = 2 (2 t - 1) T_(k-1) - T_(k-2)
+        rows[k] = 4 * rows[k - 1].roll(1) - 2 * rows[k - 1] - rows[k - 2]
+    return torch.stack(rows)
 
 
 def families(robot: Robot, regularized: bool) -> dict[str, GaussianCoordinates | FourierCoordinates | PointCoordinates]:
@@ -110,23 +126,27 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
     lines = [
         "## Study 2",
         "",
-        f"{len(study.positions)} smooth distributed loads (cubic in s, up to {AMPLITUDE:g} N/m at their knots; our choice, the "
-        "paper's loads are not at hand), 20 markers. Regularized: a `distributed` width prior for the Gaussians, coefficients of "
-        "0 +- 1 (in 4 EI / L^2, or that per L) for the others; otherwise only the weak priors that keep the state finite.",
+        f"{len(study.positions)} distributed loads: two polynomials of degree {DEGREE} in s, in local x and y, |f| < {LIMIT:g} N/m "
+        "everywhere (how the paper drew them is not printed; ours: random Chebyshev coefficients, the largest |f| between half of "
+        "the limit and the limit), 20 markers. Regularized: a `distributed` width prior for the Gaussians, coefficients of "
+        "0 +- 1 (in 4 EI / L^2, or that per L) for the others; otherwise only the weak priors that keep the state finite. The "
+        f"paper's filter may take {ITERATIONS} iterations, as our point loads may here.",
         "",
         "| noise | family (unknowns) | regularized | converged | accepted | iterations | shape RMS to the truth (mm) "
         "| error of the load carried up to s, RMS (N) | ms each |",
         "|---|---|---|---|---|---|---|---|---|",
+        *(
+            f"| the paper | {LABELS[name]} | - | {100 * share:.0f} % | - | - | {1e3 * shape:.2f} | - | - |"
+            for name, (share, shape) in PAPER.items()
+        ),
     ]
     example: dict[str, tuple[Estimate, Model]] = {}
     plan = [(noise, regularized, name) for noise in (0.0, NOISE) for regularized in (True, False) for name in LABELS]
     for noise, regularized, name in tqdm(plan, desc="study2", delay=1.0, leave=False):
-        if quick and name == "point" and (noise or not regularized):
-            continue  # minutes on the torch path
-        few = study.take(4) if quick and name == "point" else study
+        few = study
         model = Model(few.robot, families(few.robot, regularized)[name])
         start = time.perf_counter()
-        settings = IMPATIENT if name == "point" else Settings()
+        settings = POINT if name == "point" else Settings()
         fit = estimate(model, few.noisy(noise), noise or CLEAN_SIGMA, settings)
         row = figures_of(fit, few, model, time.perf_counter() - start)
         if regularized:
@@ -154,19 +174,37 @@ def _line(noise: float, name: str, regularized: bool, row: dict[str, float | Non
 
 
 def _verdict(data: dict[str, Any]) -> list[str]:
-    """The order of the families by each measure, from the figures; a family of which less than half converged is not ranked."""
-
-    def order(measure: str, noise: str) -> str:
-        values = {name: data[name][noise][measure] for name in LABELS if data[name][noise].get("converged", 0.0) > 0.5}
-        return " < ".join(sorted(values, key=lambda name: values[name]))
-
-    measures = {"shape": "shape_rms_m_mean", "load carried": "carried_force_N_mean", "iterations": "iterations_mean"}
-    ranks = [f"{label} {order(key, 'clean')} (clean), {order(key, 'noise_1mm')} (noise)" for label, key in measures.items()]
-    shares = ", ".join(f"{LABELS[name]} {100 * data[name]['noise_1mm'].get('converged', 0.0):.0f} %" for name in LABELS)
+    """Where the paper's ranking (Gaussians, then points, then Fourier, in convergence and in shape) holds with our estimator."""
+    settings = {
+        "without noise": lambda name: data[name]["clean"],
+        "with noise": lambda name: data[name]["noise_1mm"],
+        "unregularized without noise": lambda name: data[name]["unregularized"]["clean"],
+        "unregularized with noise": lambda name: data[name]["unregularized"]["noise_1mm"],
+    }
+    words = []
+    for better, worse in (("gaussian", "point"), ("gaussian", "fourier"), ("point", "fourier")):
+        where = [name for name, of in settings.items() if _ahead(of(better), of(worse))]
+        words.append(f"{NAMES[better]} before {NAMES[worse]} {' and '.join(where) or 'nowhere'}")
     return [
-        "Order of the regularized families, best first: " + "; ".join(ranks) + f". Converged with noise: {shares}. The paper's own "
-        "ranking is not at hand, so none of it is confirmed or refuted here."
+        "The paper ranks Gaussians before points before Fourier, in convergence and in shape. Our estimator confirms "
+        + "; ".join(words)
+        + ".",
+        "",
+        "Why: each family has 12 to 14 numbers, enough to follow 20 markers under any such load to micrometres, because the shape "
+        "hardly shows what varies quickly along the rod ((5)). Without noise only arriving counts, and our filter arrives with "
+        "every "
+        "family. With noise the shape error is the noise that 12 to 14 numbers let through, much the same for all. Many "
+        "arrangements of "
+        "four points then fit equally well: their places slide and seldom settle.",
     ]
+
+
+def _ahead(a: dict[str, float | None], b: dict[str, float | None]) -> bool:
+    """No less often converged, and nearer to the true shape."""
+    mine, other = a["shape_rms_m_mean"], b["shape_rms_m_mean"]
+    assert a["converged"] is not None
+    assert b["converged"] is not None
+    return a["converged"] >= b["converged"] and mine is not None and other is not None and mine < other
 
 
 def _figure(study: Study2, example: dict[str, tuple[Estimate, Model]], path: Path) -> None:

@@ -13,7 +13,8 @@ from .starts import Start, StartRule, cold_start
 def estimate(
     problem: Problem, settings: Settings | None = None, start: StartRule | Start = cold_start, progress: Progress = silent
 ) -> Estimate:
-    """Fit the unknowns of every sample to what its sensors read: the weighted least squares (3), iterated by (4).
+    """Fit the unknowns of every sample to what its sensors read: the weighted least squares (1) of the residual (3), iterated
+    by (4).
 
     problem: robot, unknowns and readings of B samples. A registration of scope SHARED is one for all samples (estimation.shared).
     start: where to start, or a rule that says so from a problem of some of the samples; a challenged start that is no nearer to the

@@ -302,10 +302,11 @@ def _units(problem: Problem) -> dict[str, float]:
     def unit(values: Float[Tensor, " k"], i: int) -> float:
         return float(values[i]) if len(values) else 0.0
 
-    state = problem.state
-    return {
+    state, loads = problem.state, problem.unknowns.loads
+    sigmoid = {name: getattr(loads, name, 0.0) for name in ("eps", "beta1", "beta2")}  # of the paper's coordinates
+    return sigmoid | {
         "length": problem.robot.rod.length,
-        "force_scale": getattr(problem.unknowns.loads, "force_scale", 1.0),
+        "force_scale": getattr(loads, "force_scale", 1.0),
         "force_unit": unit(state.base.unit, 0),
         "moment_unit": unit(state.base.unit, 3),
         "length_unit": unit(state.registration.unit, 0),

@@ -96,6 +96,8 @@ class Limits(NamedTuple):
 
     step: the largest change of any entry of x. decrement, share: converged when a further step promises to lower the cost (chi^2)
     by less than this, or by less than this share of it: a model that cannot explain the data need not be fitted to round-off.
+    gain: converged, too, when the step that is taken, damped as it is, promises less than this; 0: never. For a recursion that
+    creeps along a direction in which the cost has no minimum (the paper's width c).
     settled: the cost with adapted weights is at its minimum when a step promises less than this. The step that shows that the
     filter has arrived is taken nevertheless: it is there already, and leaves of the promised decrement next to nothing.
     """
@@ -104,6 +106,7 @@ class Limits(NamedTuple):
     decrement: float = 1e-3
     share: float = 1e-6
     settled: float = 1.0
+    gain: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -213,8 +216,10 @@ def advance(
     inflated = torch.minimum(promised.nan_to_num(0.0) / N.seen.clamp(min=1), at.cap)
     A, g, _ = N.whole(at.x, *prior, share=1 / (1 + inflated).unsqueeze(-1))
     step, Sigma = update(predict(at.Sigma, Q), A, g)
+    gain = (g * step).sum(-1)
+    done = done | ((gain < limits.gain) & sound)
     # Where the adapted problem has settled but the true one has not, the weights must move on towards the true ones.
-    cap = torch.where((g * step).sum(-1) < limits.settled, 0.1 * inflated, at.cap)
+    cap = torch.where(gain < limits.settled, 0.1 * inflated, at.cap)
     fresh = torch.isfinite(Sigma).flatten(1).all(-1) & sound
     # A model that overflowed says nothing: go half way back to the last place where it did.
     onward = torch.where(sound.unsqueeze(-1), at.x + limited(step, limits.step), 0.5 * (at.x + at.before))

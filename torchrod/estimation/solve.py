@@ -17,6 +17,7 @@ from torch import Tensor
 from .. import kernel
 from ..model.load_families import PaperCoordinates
 from ..model.problem import Problem
+from ..util.errors import InputError
 from ..util.precision import DTYPE
 from ..util.status import Status
 from ..util.threads import one_thread
@@ -29,6 +30,9 @@ CHUNK = 4096  # samples per pass: what is done once per pass and iteration no lo
 FEW = 1024  # samples for which torch's own share is done sooner on one thread
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
+PAPER_GAIN = 1e-3  # of chi^2: what the paper calls converged is not printed
+PAPER_SIZES, PAPER_ALPHA = (50.0, 50.0, 0.03, 10.0), (3.0, 0.07)  # of [a_x, a_y (N/m), eta, c (1/m^2)] and of [N, N m]
+PAPER_RATIO = 2.0  # square root of Sigma_0 over Q
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 Progress = Callable[[int], object]
 
@@ -48,6 +52,8 @@ class Settings:
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
+    gain: a sample has converged, too, when the step that the filter takes promises to lower the cost by less than this; 0: only
+    when a full Gauss-Newton step does (estimation.filter.Limits).
     Errors: ValueError for numbers that no filter can be run with.
     """
 
@@ -59,6 +65,7 @@ class Settings:
     max_iterations: int = 100
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
     robust: float = math.inf
+    gain: float = 0.0
 
     def __post_init__(self):
         for name, least in (("Sigma0", "above"), ("Q", "at least")):
@@ -81,23 +88,27 @@ class Settings:
 
 
 def paper_settings(problem: Problem, Q: float = 1.0, Sigma0: float = 1.0) -> Settings:
-    """The paper's plain recursion: no step limit, no adaptive noise.
+    """The paper's plain recursion (4): no step limit, no adaptive noise, no restart; for PaperCoordinates and alpha in SI.
 
-    Q and Sigma0 multiply the squared sizes of [a_x, a_y, eta, c] and of alpha and zeta. The paper does not print its own; these
-    sizes did best of those tried on Study 1 (docs/model.md).
+    Q and Sigma0 multiply the tuning, which the paper does not print: ours did best of those that scripts/paper_search.py tried,
+    with coordinates that start 6 mm wide and a range of 4 mm beyond the rod, and tip_std = (2e-3 N, 2e-3 N m).
+    Errors: InputError for a problem with other coordinates.
     """
     loads = problem.unknowns.loads
-    assert isinstance(loads, PaperCoordinates)
-    size = torch.tensor([100.0, 100.0, 1.0, 1e5], dtype=DTYPE).repeat(loads.count)
-    size = torch.cat([size, torch.ones(problem.size - len(size), dtype=DTYPE)])
+    if not isinstance(loads, PaperCoordinates):
+        raise InputError(f"paper_settings: the problem has {type(loads).__name__}; give it PaperCoordinates")
+    size = torch.ones(problem.size, dtype=DTYPE)  # square roots of Q's diagonal
+    size[: loads.size] = torch.tensor(PAPER_SIZES, dtype=DTYPE).repeat(loads.count)
+    size[-6:-3], size[-3:] = PAPER_ALPHA
     return Settings(
-        Sigma0=Sigma0 * size**2,
+        Sigma0=Sigma0 * PAPER_RATIO**2 * size**2,
         Q=Q * size**2,
-        step_limit=torch.inf,
+        step_limit=math.inf,
         adaptive=False,
         coarse=False,
         max_iterations=500,
         restarts=(),
+        gain=PAPER_GAIN,
     )
 
 
@@ -160,7 +171,7 @@ class Filter:
         Samples leave the batch when they have converged; a failed one never touches its neighbours.
         """
         rough, fine = models
-        limits = ekf.Limits(step=self.settings.step_limit)
+        limits = ekf.Limits(step=self.settings.step_limit, gain=self.settings.gain)
         both = limits._replace(decrement=NEAR), limits
         most = self.settings.max_iterations
         at_once = rough.iterate_all(fine, run, both, live, most)

@@ -67,7 +67,7 @@ struct Inverse : Factor {
 
 struct Filter {
     const double *mean, *precision, *Q;  // (n)
-    double step_limit, decrement, decrement_share, settled;
+    double step_limit, decrement, decrement_share, settled, enough;  // enough: ekf.Limits.gain
     // In and out, (B, n), (B, n, n), (B, n), (B), (B); then out: (B) whether converged.
     double *x, *Sigma, *before, *cap;
     const double* Sigma0;  // (B, n, n)
@@ -124,7 +124,7 @@ inline void advance(const Filter& f, const Lanes& lanes, int64_t n, const Normal
     const V shorten = smaller(f.step_limit / largest, splat(1.0));
     for (int64_t l = 0; l < lanes.count; l++) {
         const int64_t b = lanes.sample[l];
-        f.done[b] = done[l] != 0;
+        f.done[b] = done[l] != 0 || (sound[l] && gain[l] < f.enough);
         if (gain[l] < f.settled) f.cap[b] = 0.1 * inflated[l];
         for (int64_t i = 0; i < n; i++) {
             const double was = x[i][l], half = 0.5 * (was + f.before[b * n + i]);

@@ -27,7 +27,8 @@ COUNTS = (
     *("steps", "tendons", "newton", "diagonal", "outputs"),
     *("family", "count", "per_load", "gamma", "size", "tip", "tensions", "registration"),
 )
-NUMBERS = ("length", "force_scale", "force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "robust")
+NUMBERS = ("length", "force_scale", "eps", "beta1", "beta2")
+NUMBERS += ("force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "robust")
 _spent = [0.0]
 
 

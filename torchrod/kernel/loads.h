@@ -8,6 +8,7 @@ enum Family : int64_t { NONE = 0, GAUSSIAN = 1, PAPER = 2, POINT = 3, LINEAR = 4
 struct Loads {
     int64_t family, count, per_load, size;  // size: entries of gamma
     double length, force_scale;
+    double eps, beta1, beta2;  // PAPER: of its sigmoid
     const double* locations;  // (count) m where they are known, else null
     const double* basis;      // LINEAR: (3 S + 1, size, PARTS), what one unit of each entry of gamma adds
     Table s;                  // (3 S) m, the stages
@@ -47,12 +48,29 @@ INLINE V sigmoid(V x) {
     return each(x, [](double a) { return 1.0 / (1.0 + std::exp(-a)); });
 }
 
+// Where a Gaussian sits, and how that moves with its entry eta.
+struct Centre {
+    V mu, slope;
+};
+INLINE Centre logistic_centre(const Loads& l, V eta) {  // coordinates/gaussian.py
+    const V share = sigmoid(eta), mu = l.length * share;
+    return {mu, mu * (1.0 - share)};
+}
+INLINE Centre algebraic_centre(const Loads& l, V eta) {  // coordinates/paper.py, the paper's (11)
+    const double half = 0.5 * (l.beta2 - l.beta1), middle = 0.5 * (l.beta2 + l.beta1);
+    const V square = l.eps + eta * eta, r = 1.0 / root(square);
+    return {half * eta * r + middle, half * l.eps * r / square};
+}
+
 // One Gaussian's share of the table. x(j): entry j of gamma. coordinates/gaussian.py and coordinates/paper.py.
 template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t k, Gamma x, V* local) {
     const int64_t first = k * l.per_load, row = (1 + g.load_tangents) * PARTS, points = 3 * g.known->steps;
     const bool slopes = g.load_tangents, net = l.family == GAUSSIAN, placed = l.locations;
-    const V L = splat(l.length), share = placed ? V{} : sigmoid(x(first + 2));
-    const V mu = placed ? splat(l.locations[k]) : L * share, dmu = mu * (1.0 - share), last = x(first + l.per_load - 1);
+    const V L = splat(l.length), last = x(first + l.per_load - 1);
+    const Centre centre = placed ? Centre{splat(l.locations[k]), V{}}
+                          : net  ? logistic_centre(l, x(first + 2))
+                                 : algebraic_centre(l, x(first + 2));
+    const V mu = centre.mu, dmu = centre.slope;
     const V c = net ? each(last, [](double a) { return std::exp(a); }) / (L * L) : last, dc = net ? c : splat(1.0);
     const BumpAt at(mu, c);
     const Bump whole = at(L);

@@ -34,7 +34,7 @@ class Loads(ctypes.Structure):
 
     _fields_ = [
         *((n, _I) for n in ("family", "count", "per_load", "size")),
-        *((n, _D) for n in ("length", "force_scale")),
+        *((n, _D) for n in ("length", "force_scale", "eps", "beta1", "beta2")),
         *((n, _P) for n in ("locations", "basis")),
         *((n, Table) for n in ("s", "inside", "node")),
     ]
@@ -59,7 +59,7 @@ class Filter(ctypes.Structure):
 
     _fields_ = [
         *((n, _P) for n in ("mean", "precision", "Q")),
-        *((n, _D) for n in ("step", "decrement", "share", "settled")),
+        *((n, _D) for n in ("step", "decrement", "share", "settled", "gain")),
         *((n, _P) for n in ("x", "Sigma", "before", "cap", "Sigma0", "done")),
     ]
 

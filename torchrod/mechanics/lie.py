@@ -110,7 +110,7 @@ def identity_quaternion(shape: tuple[int, ...], like: Tensor) -> Quaternion:
 def move(zeta: Twist, p: Float[Tensor, "... P 3"]) -> Float[Tensor, "... P 3"]:
     """Rigid motion of points: exp(rotation) p + translation, with zeta = [translation (m), rotation vector (rad)] (..., 6).
 
-    The derivative at zeta = 0 is exact (RoMa's series). Source: the registration transform of the paper, section II.D.
+    The derivative at zeta = 0 is exact (RoMa's series). Source: the registration twist of the paper, (2).
     """
     import roma
 

@@ -184,7 +184,7 @@ class PointWrenches(Float64):
 
 @dataclass(frozen=True)
 class FourierLoads(Float64):
-    """f(s) = a_0 + sum_k a_k cos(2 pi k s / L) + b_k sin(2 pi k s / L), k = 1..K periods on the rod, (12).
+    """f(s) = a_0 + sum_k a_k cos(2 pi k s / L) + b_k sin(2 pi k s / L), k = 1..K periods on the rod.
 
     cosine: (..., 2, K + 1) with a_0 first; sine: (..., 2, K); N/m, section frame x and y.
     """
@@ -214,7 +214,7 @@ class FourierLoads(Float64):
         """None: a Fourier load has no jump."""
 
     def density(self, s: Float[Tensor, " S"]) -> Float[Tensor, "... S 3"]:
-        """f(s), (12)."""
+        """f(s)."""
         _, sin, cos = self._waves(s)
         ones = torch.cat([torch.ones_like(s).unsqueeze(-1), cos], -1)
         f = (self.cosine.unsqueeze(-3) * ones.unsqueeze(-2)).sum(-1) + (self.sine.unsqueeze(-3) * sin.unsqueeze(-2)).sum(-1)

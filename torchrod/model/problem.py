@@ -57,7 +57,8 @@ class Problem(Float64):
     robot: known but for the unknowns. unknowns: what is to be estimated of each sample. sensors: what was read of B samples, with
     its noise; their rows stand one after the other in h. tension: (B, T) N for a tendon robot, the readings of its load cells.
     steps: the least number of arc-length steps. prior: mean and precision of x instead of the unknowns' own, (n) or (B, n), in the
-    units of `state`. Errors: ValueError of `check`.
+    units of `state`. tip_std: standard deviations (N, N m) of a component of the tip residual, W^-1/2 of the paper's W on c; None:
+    TIP_FORCE_STD and TIP_MOMENT_STD in the rod's scales. Errors: ValueError of `check`.
     """
 
     robot: Robot
@@ -66,6 +67,7 @@ class Problem(Float64):
     tension: Float[Tensor, "B T"] | None = None
     steps: int = DEFAULT_STEPS
     prior: tuple[Tensor, Tensor] | None = None
+    tip_std: tuple[float, float] | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -125,7 +127,7 @@ class Problem(Float64):
     def tip_weights(self) -> Float[Tensor, " 6"]:
         """1 / variance of the tip residual c (1/N^2, 1/(N m)^2): stiff, so that (17) holds to a milli-force-scale."""
         rod = self.robot.rod
-        force, moment = TIP_FORCE_STD * rod.force_scale, TIP_MOMENT_STD * rod.moment_scale
+        force, moment = self.tip_std or (TIP_FORCE_STD * rod.force_scale, TIP_MOMENT_STD * rod.moment_scale)
         return torch.tensor([force] * 3 + [moment] * 3, dtype=DTYPE) ** -2
 
     @property

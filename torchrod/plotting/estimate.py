@@ -119,10 +119,11 @@ def draw_on(
     positions: Float[Tensor, "P 3"],
     tension: Float[Tensor, " T"] | None = None,
     truth: FittedRod | None = None,
+    true_colour: str = TRUTH,
 ) -> None:
     """Draw one sample: markers at positions (m, teal; NaN where missing), fitted rod (dark) under its tensions (N), loads (red).
 
-    Equal axes in metres. truth: the true loads where they are known (grey, and in the title).
+    Equal axes in metres. truth: the true loads where they are known (in true_colour, grey by default, and in the title).
     """
     axes.computed_zorder = False  # by depth, the arrow of a good estimate would vanish behind the true one
     scene = _scene(robot, fit, tension)
@@ -133,13 +134,14 @@ def draw_on(
     look = {"color": MARKER, "s": 28, "depthshade": False, "zorder": 6}
     axes.scatter(*seen.T.numpy(), label="markers", **look)  # pyright: ignore[reportArgumentType]
     if scene.loaded.any():
-        axes.plot(*scene.envelope[scene.loaded].T.numpy(), color=LOAD, linewidth=1, zorder=3, label="load per length")
+        envelope = torch.where(scene.loaded.unsqueeze(-1), scene.envelope, torch.nan)  # no line from one load to the next
+        axes.plot(*envelope.T.numpy(), color=LOAD, linewidth=1, zorder=3, label="load per length")
         for i in scene.loaded.nonzero().flatten().tolist():
             axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5, zorder=3)
     vectors, everything = scene.points - scene.tails, torch.cat([scene.line, seen, scene.tails, scene.envelope])
     if truth is not None:
         true_scene = _scene(robot, truth, tension)
-        _arrows(axes, true_scene, TRUTH, 6.0, "true force", 2)
+        _arrows(axes, true_scene, true_colour, 6.0, "true force", 2)
         everything = torch.cat([everything, true_scene.tails])
         both = [(_label(truth, k), _label(fit, k)) for k in range(min(len(truth.force), len(fit.force)))]
         axes.set_title("\n".join(f"true {a}, estimated {b}" for a, b in both), fontsize=12)

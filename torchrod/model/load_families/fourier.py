@@ -13,7 +13,7 @@ from .family import WEAK_STD, Gamma, LoadReport
 
 @dataclass(frozen=True)
 class FourierCoordinates:
-    """A Fourier series (12) of `periods` periods: [a_0..a_K, b_1..b_K] for x, then for y, in units of force scale / L.
+    """A Fourier series of `periods` periods: [a_0..a_K, b_1..b_K] for x, then for y, in units of force scale / L.
 
     force_std: standard deviation of each coefficient's prior about zero, in those units; weak by default.
     """

@@ -21,8 +21,9 @@ SPREAD_LIMIT = 10.0  # of log |F|: what is drawn beyond it is not used, and must
 class GaussianCoordinates:
     """The default: per load [F_x, F_y, eta, log(c L^2)], F the net force on the rod in units of the rod's force scale.
 
-    mu = L S(eta), S the logistic function (11). The amplitude is a = F / (sqrt(pi / c) x fraction of the Gaussian on the rod), so F
-    stays what the rod feels when the Gaussian hangs over the tip, where (13) does not. A known location leaves eta out.
+    mu = L S(eta), S the logistic function: ours, the paper's (11) is algebraic (PaperCoordinates). The amplitude is
+    a = F / (sqrt(pi / c) x fraction of the Gaussian on the rod), so F stays what the rod feels when the Gaussian hangs over the
+    tip, where (13) does not. A known location leaves eta out.
     force_std: standard deviation of each force component's prior about zero, in force scales; weak by default.
     """
 
