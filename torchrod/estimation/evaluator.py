@@ -84,7 +84,7 @@ def _nodes_of(nodes: Float[Tensor, "B S1"], at: Float[Tensor, "B K"]) -> Int[Ten
 
 @dataclass(frozen=True)
 class Layout:
-    """What stays from shape to shape, by the names of kernel.fitting. active: (S, 3, T), 1 where a tendon pulls."""
+    """What stays from shape to shape, by the names of kernel.bindings. active: (S, 3, T), 1 where a tendon pulls."""
 
     tensors: dict[str, Tensor | None]
     counts: dict[str, int]
@@ -161,7 +161,7 @@ def _kept_layout(model: Model, s: Tensor, offsets: Tensor | None, now: tuple[int
 
 
 def _tables(model: Model, markers: Markers, w: Float[Tensor, "B z"], nu: float, x: Float[Tensor, "B n"] | None) -> kernel.FitTables:
-    """Everything of kernel.fitting. The layout is kept for the next shapes, unless a tensor in it has been changed since."""
+    """Everything of kernel.FitTables. The layout is kept for the next shapes, unless a tensor in it has been changed since."""
     robot = model.robot
     if x is None:
         now = robot.versions + versions(markers.s, markers.offsets)
@@ -212,10 +212,7 @@ class Prepared:
 
     def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
         """Model.h, without derivatives."""
-        if not self.compiled:
-            return self.model.h(x, self.markers, differentiable=False)
-        t = self.tables(x)
-        return kernel.measure_now(x, torch.arange(len(x)), False, t.structure, t.markers)[0]
+        return self.model.h(x, self.markers, differentiable=False)
 
     def residual(self, h: Float[Tensor, "B z"]) -> Float[Tensor, "B z"]:
         """r = z - h(x), zero where a marker is missing."""
