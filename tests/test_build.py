@@ -14,17 +14,17 @@ from tests.test_fast import needs_compiler
 from torchrod.cli import main
 from torchrod.kernel import bindings, build
 
-SAID = """
-import warnings
-from torchrod import kernel
-with warnings.catch_warnings(record=True) as seen:
-    warnings.simplefilter("always")
-    assert [kernel.library() for _ in range(3)] == [None] * 3
-said = [str(w.message) for w in seen if "no compiled kernel" in str(w.message)]
-assert len(said) == 1, said
-print(said[0])
+# build.py alone, which needs no torch and starts at once.
+ALONE = f"import sys; sys.path.insert(0, {str(build.FOLDER)!r}); import build\n"
+LOADED = ALONE + "found = build.find(lambda library: None); assert not isinstance(found, str), found"
+SAID = (
+    ALONE
+    + """
+found = [build.find(lambda library: None) for _ in range(3)]
+assert isinstance(found[0], str) and found == found[:1] * 3, found
+print(found[0])
 """
-LOADED = "from torchrod import kernel; assert kernel.available()"
+)
 
 
 def compiler(folder: Path, *lines: str) -> Path:
@@ -85,7 +85,7 @@ def test_without_a_home_there_is_the_folder_for_temporary_files(tmp_path):
     assert left(own) == [".sha256", ".so"]
     assert own.stat().st_mode & 0o777 == 0o700
     own.chmod(0o777)
-    assert "TORCHROD_CACHE" in run(homeless + SAID, cxx, Path(), TORCHROD_CACHE="", TMPDIR=str(tmp_path))
+    assert "chmod go-w" in run(homeless + SAID, cxx, Path(), TORCHROD_CACHE="", TMPDIR=str(tmp_path))
 
 
 @needs_compiler
@@ -109,19 +109,21 @@ def waiting(folder: Path, what: str) -> None:
         time.sleep(0.02)
 
 
-FORKED = """
-import os, pathlib, threading, time, warnings
-from torchrod.kernel import bindings
-warnings.simplefilter("error")
+FORKED = (
+    ALONE
+    + """
+import os, pathlib, threading, time
+def there():
+    return not isinstance(build.find(lambda library: None), str)
 def child():
     pid = os.fork()
     if pid == 0:
         try:
-            os._exit(0 if bindings.available() else 1)
+            os._exit(0 if there() else 1)
         except BaseException:
             os._exit(2)
     return pid
-thread = threading.Thread(target=bindings.library)
+thread = threading.Thread(target=there)
 thread.start()
 while not pathlib.Path({builds!r}).exists():
     time.sleep(0.02)
@@ -129,30 +131,33 @@ early = child()  # while the build is under way, with the thread's locks held
 thread.join()
 for pid in (early, child()):
     assert os.waitpid(pid, 0)[1] == 0
-assert bindings.available()
+assert there()
 """
+)
 
 
 @needs_compiler
 def test_a_forked_child_waits_for_its_parents_build(tmp_path):
     builds = tmp_path / "builds"
     cxx = copying(tmp_path, f"echo once >> {builds}", "sleep 1")
-    run(FORKED.format(builds=str(builds)), cxx, tmp_path / "cache")
+    run(FORKED.replace("{builds!r}", repr(str(builds))), cxx, tmp_path / "cache")
     assert builds.read_text() == "once\n"
 
 
-THREADS = """
+THREADS = (
+    ALONE
+    + """
 import threading
-from torchrod import kernel
 start, found = threading.Barrier(8), []
 def ask():
     start.wait()
-    found.append(kernel.library())
+    found.append(build.find(lambda library: None))
 threads = [threading.Thread(target=ask) for _ in range(8)]
 for thread in threads: thread.start()
 for thread in threads: thread.join()
-assert len(found) == 8 and None not in found
+assert len(found) == 8 and found == found[:1] * 8 and not isinstance(found[0], str)
 """
+)
 
 
 @needs_compiler
@@ -168,7 +173,7 @@ def test_threads_that_ask_at_once_begin_one_build_under_a_name_of_its_own(tmp_pa
 @needs_compiler
 def test_processes_that_begin_at_once_build_once(tmp_path):
     """And both wait for it, with one line each."""
-    cxx = copying(tmp_path, f"echo once >> {tmp_path}/builds", "sleep 6")
+    cxx = copying(tmp_path, f"echo once >> {tmp_path}/builds", "sleep 2")
     both = [begin(LOADED, cxx, tmp_path / "cache") for _ in range(2)]
     assert [ended(process)[1] for process in both] == [build.LINE + "\n"] * 2
     assert (tmp_path / "builds").read_text() == "once\n"
@@ -208,8 +213,8 @@ def test_ctrl_c_leaves_no_compiler_and_no_file_behind(tmp_path):
 
 def test_a_compiler_that_hangs_is_given_up(tmp_path):
     cxx = compiler(tmp_path, "sleep 300")
-    hasty = "from torchrod.kernel import build\nbuild.GIVE_UP = 0.5\n"
-    assert "has not finished in" in run(hasty + SAID, cxx, tmp_path / "cache")
+    hasty = "build.GIVE_UP = 0.5\n"
+    assert "has not finished in" in run(SAID.replace(ALONE, ALONE + hasty), cxx, tmp_path / "cache")
     assert left(tmp_path / "cache") == []
 
 
@@ -275,6 +280,19 @@ def other_library(folder: Path, layout: str, functions: tuple[str, ...]) -> Path
     return library
 
 
+def looking_in(cache: Path, cxx: Path, monkeypatch: pytest.MonkeyPatch):
+    """What a new process would find there, with the whole check."""
+    library = build.target()
+    monkeypatch.setattr(build, "target", lambda: cache / library.name)
+    monkeypatch.setattr(build, "_compiler", lambda: str(cxx))
+
+    def found():
+        monkeypatch.setattr(build, "_found", [])
+        return bindings.found()
+
+    return found
+
+
 SWAPPED = bindings.layout().replace("step:40:8d decrement:48:8d", "decrement:40:8d step:48:8d")
 
 
@@ -288,22 +306,25 @@ SWAPPED = bindings.layout().replace("step:40:8d decrement:48:8d", "decrement:40:
     ],
     ids=["fields in another order", "another constant", "a function is not there"],
 )
-def test_a_library_of_other_sources_is_made_anew_once(tmp_path, layout, functions, said):
+def test_a_library_of_other_sources_is_made_anew_once(tmp_path, monkeypatch, layout, functions, said):
     """By the compiler; and where that makes no better one there is a sentence instead of a traceback."""
     assert layout != bindings.layout() or len(functions) < len(bindings.FUNCTIONS)
     other, cache = other_library(tmp_path, layout, functions), tmp_path / "cache"
-    cxx = copying(tmp_path, f"echo once >> {tmp_path}/builds")
-    run(LOADED, cxx, cache)
-    (library,) = cache.glob("*.so")
+    builds, whole = tmp_path / "builds", build.target().read_bytes()
+    fresh = looking_in(cache, copying(tmp_path, f"echo once >> {builds}"), monkeypatch)
+    assert not isinstance(fresh(), str)
+    library = build.target()
+    library.unlink()  # this process has it in its memory: to write over it would kill the process
     library.write_bytes(other.read_bytes())
+    library.chmod(0o700)
     library.with_suffix(".sha256").write_text(hashlib.sha256(other.read_bytes()).hexdigest())
-    run(LOADED, cxx, cache)
-    assert (tmp_path / "builds").read_text() == "once\n" * 2
-    assert library.read_bytes() == build.target().read_bytes()
+    assert not isinstance(fresh(), str)
+    assert builds.read_text() == "once\n" * 2
+    assert library.read_bytes() == whole
     library.unlink()
-    compiler(tmp_path, f'cp {other} "$last"', f"echo once >> {tmp_path}/builds")
-    assert said in run(SAID, cxx, cache)
-    assert (tmp_path / "builds").read_text() == "once\n" * 3
+    compiler(tmp_path, f'cp {other} "$last"', f"echo once >> {builds}")
+    assert said in str(fresh())
+    assert builds.read_text() == "once\n" * 3
     assert left(cache) == [".sha256"]
 
 

@@ -15,7 +15,6 @@ from torchrod import WarmStart
 from torchrod.learned.features import ACTIVE_SIZE, PASSIVE_SIZE
 from torchrod.mechanics.tendons import NEWTON_STEPS
 from training.cases import LEAST_SEEN, Recipe, block, generator_of, random_robot
-from training.data import ShapeData
 from training.train import main
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -134,7 +134,10 @@ FUNCTIONS: dict[str, tuple[type, ...]] = {
 
 
 def layout() -> str:
-    """Structures (fields with offset, size and kind), constants and functions as the C++ has to have them, a line each: layout.h."""
+    """What the library has to say of itself (layout.h): its structures, constants and functions, a line each.
+
+    A field is name:offset:size and its kind, an argument its kind: i an integer, d a number, p a pointer, s a structure.
+    """
     kinds = {_I: "i", _D: "d", _P: "p"}
 
     def fields(S: type[ctypes.Structure]) -> str:

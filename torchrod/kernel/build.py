@@ -4,9 +4,9 @@ The first call that needs the library builds it and waits, about 20 s once per m
 there is no compiler the torch path serves, more slowly, and one warning says so. TORCHROD_FAST=0 switches the library off;
 TORCHROD_CACHE names another folder for it (default ~/.cache/torchrod).
 
-Code is run from that folder. So a library is loaded only if folder and file belong to this user (or root), nobody else may write to
-them, nobody but the owners of its parents can put another folder in its place, and the file has the checksum that was written beside
-it when it was built.
+Code is run from that folder. So a library is loaded only if folder and file belong to this user or root, nobody else may write to
+them, no parent lets every user put another folder in its place, and the file has the checksum that was written beside it when it
+was built.
 
 This module imports nothing but the standard library: pip's build runs it before torch is there (hatch_build.py).
 """
@@ -138,7 +138,7 @@ def _whole(library: Path) -> bool:
         return False
     except OSError as error:
         raise RefusedError(f"{library}: {error.strerror}; delete it") from None
-    with open(handle, "rb") as file:
+    with os.fdopen(handle, "rb") as file:
         _own(os.fstat(handle), library, "delete it")
         try:
             expected = _checksum(library).read_text().strip()
@@ -180,11 +180,10 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def _run(command: list[str], messages: Path) -> int:
     """The exit status of a compiler, whose processes end with the wait for it: Ctrl-C leaves none behind."""
-    path = {"PATH": os.pathsep.join(filter(None, (os.environ.get("PATH"), "/usr/bin", "/bin")))}
+    path = os.pathsep.join(filter(None, (os.environ.get("PATH"), "/usr/bin", "/bin")))
     with messages.open("wb") as stderr:  # not a pipe, which a talkative compiler fills
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr, env=os.environ | path, start_new_session=True
-        )
+        files = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": stderr}
+        process = subprocess.Popen(command, env=os.environ | {"PATH": path}, start_new_session=True, **files)
     try:
         return process.wait(GIVE_UP)
     except BaseException:
