@@ -67,9 +67,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="fewer batches and calls, two minutes")
     parser.add_argument("--json", type=Path, help="write the figures as data")
     parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of page and picture")
-    # torch.compile takes a minute for every batch size and number of loads: only where it is asked for.
-    swift = [name for name in PATHS if name != "torchrod, compiled"]
-    parser.add_argument("--paths", nargs="+", choices=PATHS, default=swift, help="which paths and peers, beside torchrod's kernel")
+    parser.add_argument("--paths", nargs="+", choices=PATHS, default=PATHS, help="which paths and peers, beside torchrod's kernel")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     chosen = [name for name in PATHS if name == "torchrod" or name in options.paths]

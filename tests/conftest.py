@@ -14,7 +14,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "third_party"
 
 def pytest_collection_modifyitems(items):
     """Without the kernel a fit takes hundreds of times longer: tests of many of them would take hours."""
-    if os.environ.get("TORCHROD_EVERY") or kernel.library(wait=True) is not None:
+    if os.environ.get("TORCHROD_EVERY") or kernel.available():
         return
     reason = "no kernel here, and this takes minutes by the torch path; TORCHROD_EVERY=1 runs it all the same"
     for item in items:

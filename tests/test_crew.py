@@ -16,11 +16,11 @@ from torchrod.estimation.evaluator import Prepared
 BEGIN = """
 import os, threading
 import torch
-from torchrod import fast
+from torchrod import kernel
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)
 from tests import test_crew
-assert kernel.library(wait=True) is not None
+assert kernel.available()
 call, tasks = test_crew.caller(400), lambda: len(os.listdir("/proc/self/task"))
 torch.set_num_threads(3)
 """

@@ -1,6 +1,6 @@
 """The compiled fit against the torch model, which is the definition: h, H, normal equations, the filter's iteration, whole fits.
 
-Whoever changes the torch step, a load family, the measurement or the filter without torchrod/fast fails here.
+Whoever changes the torch step, a load family, the measurement or the filter without torchrod/kernel fails here.
 """
 
 import math
@@ -72,6 +72,19 @@ def case(robot: Robot, coordinates, registration: bool, tip: str, tension_std=No
     return model, Markers(T([0.1, 0.25, 0.4]), positions, 0.01 * torch.eye(3), tension), x
 
 
+def kernel_rows(tables: kernel.FitTables, x: torch.Tensor, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """h (B, z) and H (B, z, n) of the kernel, from its normal equations with weight on one row after another: g = H_z r_z."""
+    target = torch.cat([positions.flatten(1), x.new_zeros(B, 6)], -1)
+    h, H = [], []
+    for w in torch.eye(target.shape[1]):
+        one = tables.with_rows(positions, w.repeat(B, 1), math.inf)
+        _, g, _, r, _ = kernel.normal_equations_now(x, one.structure, one.markers)
+        at = w.argmax()
+        h.append(target[:, at] - r[:, at])
+        H.append(g.sum(1) / r[:, at].unsqueeze(-1))
+    return torch.stack(h, 1), torch.stack(H, 1)
+
+
 FRAMES = {
     "plain": (False, "none"),
     "zeta, tip wrench, tensions": (True, "wrench", 0.5),
@@ -93,15 +106,15 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     assert prepared.compiled
     h, H = forward_jacobian(lambda x: model.h(x, markers), x)
     tables = prepared.tables(x)
-    found = kernel.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
-    assert close(found[0], h)
-    assert close(found[1], H)
-    assert close(prepared.h(x), h)
-    assert close(found[2], model.shape(x, markers).p)
+    rows = kernel_rows(tables, x, markers.positions)
+    seen = ~torch.cat([markers.positions.isnan().flatten(1), torch.zeros(B, 6, dtype=torch.bool)], -1)
+    assert close(rows[0][seen], h[seen])
+    assert close(rows[1][seen], H[seen])
     expected, sums = ekf.normal_equations(H, prepared.residual(h), prepared.w, 4.0), prepared.sums(x)
     for name in ("A", "g", "cost"):
         assert close(getattr(sums, name), getattr(expected, name)), name
     assert close(sums.r, prepared.residual(h))
+    assert close(sums.line, model.shape(x, markers).p)
     mean, precision = model.prior()
     assert close(prepared.cost(x), expected.cost.sum(-1) + (precision * (mean - x) ** 2).sum(-1))
 
@@ -159,14 +172,13 @@ def test_one_iteration_of_the_filter():
 def test_another_type_of_number_is_refused_before_the_kernel_writes_beyond_it():
     model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
     prepared = Prepared(model, markers, model.weights(markers, 1e-3))
-    tables, index = prepared.tables(x), torch.arange(B)
-    with pytest.raises(TypeError, match=r"x is torch.float32.*torch.float64"):
-        kernel.measure_now(x.float(), index, True, tables.structure, tables.markers)
-    with pytest.raises(TypeError, match=r"index is torch.int32.*torch.int64"):
-        kernel.measure_now(x, index.int(), True, tables.structure, tables.markers)
-    for call in (prepared.cost, prepared.sums, prepared.h):
-        with pytest.raises(TypeError, match=r"x is torch.float32"):
+    tables = prepared.tables(x)
+    for call in (prepared.cost, prepared.sums):
+        with pytest.raises(TypeError, match=r"x is torch.float32.*torch.float64"):
             call(x.float())
+    mean, precision = model.prior()
+    with pytest.raises(TypeError, match=r"mean is torch.float32"):
+        kernel.cost_now(x, mean.float(), precision, tables.structure)
     with pytest.raises(TypeError, match=r"positions is torch.float32"):
         tables.with_rows(markers.positions.float(), prepared.w, 4.0)
     sums = kernel.Sums.room(B, model.size, 3)
@@ -175,44 +187,41 @@ def test_another_type_of_number_is_refused_before_the_kernel_writes_beyond_it():
     for wrong in ({"x": x.float()}, {"x": x.clone(), "done": torch.zeros(B)}):
         with pytest.raises(TypeError, match=f"{list(wrong)[-1]} is torch"):
             prepared.iteration(ekf.Iterate(**(state | wrong)), Sigma0, Q, ekf.Limits(), sums)
+    fine = prepared.compiled_iteration(ekf.Iterate(**(state | {"x": x.clone()})), Sigma0, Q, ekf.Limits(), sums)
+    with pytest.raises(TypeError, match=r"live is torch.int32.*torch.int64"):
+        fine(tables, torch.arange(B).int())
 
 
-def test_gradients_and_transforms_go_through_the_operator():
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), True, "none")
-    tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
-    index = torch.arange(B)
-    h, H = model.linearized(x, markers)
+def test_a_prior_may_have_a_row_per_sample():
+    """Cost, covariance and iterations of a batch whose samples have priors of their own are those of the samples one by one."""
+    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), True, "force")
+    n, generator = model.size, torch.Generator().manual_seed(4)
+    mean, precision = 0.3 * torch.randn(B, n, generator=generator), 50.0 + 100.0 * torch.rand(B, n, generator=generator)
+    Sigma0, Q, limits = 0.5 * torch.eye(n).repeat(B, 1, 1), 0.1 * torch.ones(n), ekf.Limits()._asdict()
 
-    def measured(x):
-        return kernel.measured(x, index, tables)
+    def run(index: torch.Tensor, mean: torch.Tensor, precision: torch.Tensor) -> list[torch.Tensor]:
+        few, at, b = markers.take(index), x[index], len(index)
+        prepared = Prepared(model, few, model.weights(few, 0.1))
+        tables, sums = prepared.tables(at), prepared.sums(at)
+        cost = kernel.cost_now(at, mean, precision, tables.structure)
+        found = [cost, *kernel.posterior_now(sums, at, mean, precision, 100.0)]
+        state = {"x": at.clone(), "Sigma": Sigma0[index].clone(), "before": at.clone(), "cap": torch.full((b,), torch.inf)}
+        state["done"] = torch.zeros(b, dtype=torch.bool)
+        filtering = {"Sigma0": Sigma0[index].contiguous(), "mean": mean, "precision": precision, "Q": Q}
+        once = kernel.Iteration(state, filtering, limits, kernel.Sums.room(b, n, 3))
+        once(tables, torch.arange(b).flip(0))
+        found += [state[name].clone() for name in ("x", "Sigma", "cap")]
+        converged, count = kernel.iterate_all((once, tables), (once, tables), torch.arange(b), torch.ones(b, dtype=torch.bool), 20)
+        return [*found, state["x"], converged, count]
 
-    assert close(measured(x), h)
-    dx, dh = torch.randn_like(x), torch.randn_like(h)
-    assert close(torch.func.jvp(measured, (x,), (dx,))[1], (H @ dx.unsqueeze(-1)).squeeze(-1))
-    assert close(torch.func.vjp(measured, x)[1](dh)[0], (H.mT @ dh.unsqueeze(-1)).squeeze(-1))
-    leaf = x.clone().requires_grad_()
-    (measured(leaf) * dh).sum().backward()
-    assert leaf.grad is not None
-    assert close(leaf.grad, (H.mT @ dh.unsqueeze(-1)).squeeze(-1))
-    assert close(torch.func.vmap(measured)(torch.stack([x, 0.9 * x]))[1], measured(0.9 * x))
-    _, J = forward_jacobian(measured, x)
-    assert close(J, H)
-    arguments = (x, index, True, tables.tensors, tables.counts, tables.numbers)
-    torch.library.opcheck(kernel.measure, arguments, test_utils=("test_schema", "test_faketensor", "test_autograd_registration"))
-    torch.library.opcheck(kernel.normal_equations, (x, *arguments[3:]), test_utils=("test_schema", "test_faketensor"))
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_torch_compile_goes_through_the_operator():
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
-    tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
-
-    def cost(x):
-        h, H, _ = kernel.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
-        return (h * h).sum(-1) + (H * H).sum((-1, -2))
-
-    compiled = torch.compile(cost, backend="aot_eager", fullgraph=True)
-    assert close(compiled(x), cost(x))
+    together = run(torch.arange(B), mean, precision)
+    for b in range(B):
+        alone = run(torch.tensor([b]), mean[b], precision[b])  # one prior, which the batch shares
+        for whole, one in zip(together, alone, strict=True):
+            assert torch.allclose(whole[b].double(), one[0].double(), rtol=1e-11, atol=1e-13)
+    wrong = run(torch.arange(B), mean[0], precision)
+    for name in (0, 3):  # cost, x
+        assert not torch.allclose(wrong[name][1:], together[name][1:], rtol=1e-6)
 
 
 def fits(model: Model, markers: Markers, settings: Settings | None = None):

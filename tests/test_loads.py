@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from tests.robots import T, steel_rod
 from torchrod import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads, shape_from_base
+from torchrod.mechanics.loads import on_rod_fraction
 
 L = 0.4
 
@@ -70,8 +71,8 @@ def test_net_force_is_the_papers_13_and_the_rod_feels_less_at_the_tip():
     assert whole is not None
     felt = whole[0, 0, :2]
     assert torch.allclose(load.net_force()[0], T([3.0, 4.0]) * math.sqrt(math.pi / 800))
-    assert torch.allclose(felt, load.net_force()[0] * load.fraction_on_rod(L))
-    assert abs(float(load.fraction_on_rod(L)) - 0.5) < 1e-9
+    assert torch.allclose(felt, load.net_force()[0] * on_rod_fraction(load.mu, load.c, L))
+    assert abs(float(on_rod_fraction(load.mu, load.c, L)) - 0.5) < 1e-9
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -1,7 +1,6 @@
 """Training: its cases are what they say, and a small run goes through, resumes and repeats itself."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +11,10 @@ pytest.importorskip("lightning", reason="lightning is not installed: pip install
 
 from safetensors.torch import load_file
 
-from torchrod import WarmStart, kernel
+from torchrod import WarmStart
 from torchrod.learned.features import ACTIVE_SIZE, PASSIVE_SIZE
 from torchrod.mechanics.tendons import NEWTON_STEPS
 from training.cases import LEAST_SEEN, Recipe, block, generator_of, random_robot
-from training.data import ShapeData
 from training.train import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,19 +46,8 @@ def test_a_block_is_a_pure_function_of_its_recipe(recipe, inputs):
     assert (eta.diff(dim=-1) >= 0).all(), "loads from the base to the tip"
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_no_case_is_made_before_the_kernel_is_built(tmp_path, monkeypatch, workers):
-    """Otherwise the cases of a first run would be the torch path's up to some block."""
-    events = []
-    monkeypatch.setattr(kernel, "library", lambda wait=False: events.append(("library", wait)))
-    monkeypatch.setattr("training.data.block", lambda *_: events.append(("block",)) or {"x": torch.zeros(1)})
-    monkeypatch.setattr("training.data.ProcessPoolExecutor", lambda *_: ThreadPoolExecutor(1))
-    ShapeData(SMALL, cache=str(tmp_path), workers=workers).prepare_data()
-    assert events == [("library", True), *[("library", True), ("block",)] * SMALL.blocks]
-
-
 def test_a_block_may_be_larger_than_a_chunk_of_the_estimator(monkeypatch):
-    """Where there is no kernel, or it is still being built, chunks are smaller than the blocks of the shipped recipes."""
+    """Where there is no kernel, chunks are smaller than the blocks of the shipped recipes."""
     whole = block(SMALL, 0)
     monkeypatch.setattr("torchrod.estimation.solve.CHUNK", 40)
     monkeypatch.setattr("torchrod.estimation.solve.CHUNK_TORCH", 40)

@@ -18,7 +18,6 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 from tqdm import tqdm
 
 import torchrod
-from torchrod import kernel
 
 from .cases import COLUMNS, Recipe, block
 
@@ -26,11 +25,7 @@ HELD_OUT = 50  # of so many blocks one is not learned from, and two at least
 
 
 def make_block(recipe: Recipe, folder: Path, index: int) -> None:
-    """Write one block, under another name until it is whole; on one thread, so that no sum depends on how it was divided.
-
-    It waits for the kernel where that is being built: no case may depend on when that ends.
-    """
-    kernel.library(wait=True)
+    """Write one block, under another name until it is whole; on one thread, so that no sum depends on how it was divided."""
     path = folder / f"{index:04d}.safetensors"
     part = path.with_suffix(f".{os.getpid()}")
     before = torch.get_num_threads(), torch.get_default_dtype()
@@ -80,8 +75,6 @@ class ShapeData(LightningDataModule):
         """Make the blocks that are not there."""
         self.folder.mkdir(parents=True, exist_ok=True)
         missing = [i for i in range(self.recipe.blocks) if not (self.folder / f"{i:04d}.safetensors").is_file()]
-        if missing:
-            kernel.library(wait=True)  # here as well, so that the processes do not all begin a build
         make = partial(make_block, self.recipe, self.folder)
         if self.workers < 2 or len(missing) < 2:
             for i in tqdm(missing, desc="cases", unit="block", delay=1.0, disable=None):

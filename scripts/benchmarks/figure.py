@@ -11,7 +11,6 @@ from .report import MICRO, label
 
 COLOURS = {
     "torchrod": "#c8102e",
-    "torchrod, compiled": "#e87722",
     "torchrod, eager": "#7a4b94",
     "numba": "#0a7f8c",
     "jax": "#1b2a41",
@@ -20,7 +19,6 @@ COLOURS = {
 }
 MARKS = {
     "torchrod": "o",
-    "torchrod, compiled": "P",
     "torchrod, eager": "X",
     "numba": "D",
     "jax": "s",

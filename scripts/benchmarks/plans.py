@@ -20,7 +20,7 @@ class Plan:
     rounds: int = 2
     budget: float = 1.0
     largest: dict[str, int] = field(default_factory=lambda: {"torchrod, eager": 1024, "scipy": 1})
-    growing: tuple[str, ...] = ("torchrod", "torchrod, compiled", "numba", "jax, tuned")
+    growing: tuple[str, ...] = ("torchrod", "numba", "jax, tuned")
     growth_batch: int = 256
     steps: tuple[int, ...] = (20, 40, 80, 160)
     markers: tuple[int, ...] = (5, 10, 20, 40)

@@ -17,7 +17,6 @@ PATIENCE = 900  # seconds that a worker may take for a job
 TORCHROD = {
     "torchrod": {},
     "torchrod, eager": {"TORCHROD_FAST": "0"},
-    "torchrod, compiled": {"TORCHROD_FAST": "0", "TORCHROD_COMPILE": "inductor"},
 }
 
 

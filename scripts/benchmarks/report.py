@@ -8,7 +8,6 @@ PAGE = f"# Performance\n\n{BEGIN}\n{END}\n"
 LABELS = {
     "torchrod": "torchrod, compiled kernel",
     "torchrod, eager": "torchrod, eager torch",
-    "torchrod, compiled": "torchrod, torch.compile",
     "numba": "numba",
     "jax": "JAX",
     "jax, tuned": "JAX, tuned",

@@ -136,6 +136,11 @@ def _plot_parser() -> ArgumentParser:
     return parser
 
 
+def _build_parser() -> ArgumentParser:
+    about = "Compile the kernel for this machine, which the first estimate would do otherwise (about 20 s, needs a C++ compiler)."
+    return _Parser(description=about)
+
+
 COMMANDS = {
     "estimate": (_estimate_parser, "loads from marker positions"),
     "calibrate": (_calibrate_parser, "mass per length from unloaded shapes"),
@@ -143,6 +148,7 @@ COMMANDS = {
     "simulate": (_simulate_parser, "marker positions from known loads"),
     "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
     "plot": (_plot_parser, "a figure of an estimate"),
+    "build": (_build_parser, "compile the kernel before it is needed"),
 }
 
 
@@ -173,7 +179,7 @@ def _run(options: Namespace) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command `torchrod`. Exit status 0 when it did its work, 2 with one line on stderr for bad input."""
+    """The command `torchrod`. Exit status 0 when it did its work, 2 with one line on stderr for bad input, 130 after Ctrl-C."""
 
     def one_line(message: Warning | str, *_: object) -> None:
         print(f"torchrod: warning: {message}", file=sys.stderr)  # noqa: T201
@@ -186,4 +192,7 @@ def main(arguments: list[str] | None = None) -> int:
     except InputError as error:
         print(f"torchrod: {error}", file=sys.stderr)  # noqa: T201
         return 2
+    except KeyboardInterrupt:
+        print("torchrod: interrupted", file=sys.stderr)  # noqa: T201
+        return 130
     return 0

@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .. import kernel
 from ..mechanics.loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from ..mechanics.robot import Robot
 from ..mechanics.statics import solve_shape
@@ -190,7 +189,6 @@ def simulate_shard(spec: DatasetSpec, index: int) -> dict[str, np.ndarray]:
     Draws without an equilibrium are replaced by further draws, so that the number of samples is exact.
     Errors: InputError where more than half of the draws have none.
     """
-    kernel.library(wait=True)  # the torch path has other last bits: nothing may depend on when a build ends
     robot, n = spec.robot_of(index), spec.samples_in(index)
     rng, blocks, drawn, kept = _stream(spec, index, 0), [], 0, 0
     with one_thread(kernel=True):  # a shard is a process's; and no result can depend on how a sum was divided

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import kernel
 from ..util.errors import InputError
 from .dataset import DatasetSpec, simulate_shard
 from .shards import write_shard
@@ -34,8 +33,6 @@ def produce(
     workers: processes on this machine; scheduler: the address of a dask cluster, tcp://host:port, to be used instead.
     Errors: InputError from the shards themselves, or where the workers are not there or have died; what is written stays.
     """
-    if scheduler is None:
-        kernel.library(wait=True)  # every shard waits for it, and one build is enough for all processes
     with contextlib.ExitStack() as stack:
         if scheduler is not None:
             executor, width = stack.enter_context(_cluster(scheduler))

@@ -27,7 +27,6 @@ from ..model.problem import TIP_EXACT, Problem
 from ..util.by_value import Kept, key
 from . import filter as ekf
 
-MOST_TENDONS = 16  # of the kernel
 _layouts = Kept()
 
 
@@ -102,7 +101,7 @@ def evaluator(problem: Problem, nu: float = math.inf) -> Evaluator:
 def kernel_serves(problem: Problem) -> bool:
     """Whether the kernel can do the fit. Nodes that move with a point load take along neither curvature nor routing that vary."""
     robot, family = problem.robot, family_of(problem)
-    if problem.markers is None or family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > MOST_TENDONS:
+    if problem.markers is None or family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
     if family == "point":
         straight = all(len(t.routing) == 1 for t in robot.tendons.tendons)
@@ -249,7 +248,7 @@ class KernelEvaluator:
 
 @dataclass(frozen=True)
 class Layout:
-    """What stays from shape to shape, by the names of the kernel's bindings. active: (S, 3, T), 1 where a tendon pulls."""
+    """What stays from shape to shape, by the names of kernel.bindings. active: (S, 3, T), 1 where a tendon pulls."""
 
     tensors: dict[str, Tensor | None]
     counts: dict[str, int]

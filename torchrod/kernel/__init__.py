@@ -1,27 +1,29 @@
-"""The compiled kernel: built on first use (build), and what it computes: the march (marching), the fit (fitting, derivatives)."""
+"""The compiled kernel: how it is built and loaded (build), and what it computes, as Python calls it (bindings)."""
 
-from .build import available, library
-from .derivatives import measured
-from .filtering import Iteration, iterate_all
-from .fitting import (
+from .bindings import (
     FAMILIES,
+    MOST_TENDONS,
+    SHARED_DIMENSIONS,
     FitTables,
+    Iteration,
+    Perceptron,
     Sums,
+    available,
     balance_now,
     cost_now,
-    measure,
-    measure_now,
-    normal_equations,
+    found,
+    iterate_all,
+    library,
+    march_linearized,
     normal_equations_now,
     posterior_now,
     seconds,
+    with_rows,
 )
-from .marching import march_linearized, with_rows
-from .perceptron import Perceptron
-from .structures import SHARED_DIMENSIONS
 
 __all__ = [
     "FAMILIES",
+    "MOST_TENDONS",
     "SHARED_DIMENSIONS",
     "FitTables",
     "Iteration",
@@ -30,13 +32,10 @@ __all__ = [
     "available",
     "balance_now",
     "cost_now",
+    "found",
     "iterate_all",
     "library",
     "march_linearized",
-    "measure",
-    "measure_now",
-    "measured",
-    "normal_equations",
     "normal_equations_now",
     "posterior_now",
     "seconds",

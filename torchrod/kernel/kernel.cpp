@@ -1,9 +1,8 @@
 // The library's entry points: each shares its samples among threads, in groups of W.
 
-#include "balance.h"
-#include "course.h"
-#include "mlp.h"
-#include "threads.h"
+#include "layout.h"
+#include "statics.h"
+#include "thread_pool.h"
 
 namespace {
 
@@ -27,15 +26,6 @@ template <class Work> void in_groups(int64_t count, const int64_t* index, int64_
 }  // namespace
 
 extern "C" {
-
-// States at the outputs and their tangents, of which the first load_tangents also move the local loads by dlocal.
-struct March {
-    Known known;
-    int64_t batch, tangents, load_tangents, reverse;
-    const double *y0, *dy0;        // (B, 13), (B, 13, n)
-    const double *local, *dlocal;  // (B, S, 3, 6) = [G, G2], (B, S, 3, 6, load_tangents), or null
-    double *out, *dout;            // (B, P, 13), (B, P, 13, n)
-};
 
 void torchrod_march(const March* m, int64_t threads) {
     const Known& known = m->known;
@@ -73,30 +63,8 @@ void torchrod_march(const March* m, int64_t threads) {
     });
 }
 
-// h (b, Z), H (b, Z, n) and the centre line (b, P, 3) of the samples `index` at x (b, n); H and the line may be null.
-void torchrod_measure(const Fit* f, const double* x, const int64_t* index, int64_t count, double* h, double* H, double* line,
-                      int64_t threads) {
-    const int64_t n = f->size, P = f->known.outputs - 1, Z = 3 * P + PLAIN;
-    std::vector<int64_t> own(count);
-    for (int64_t i = 0; i < count; i++) own[i] = i;
-    in_groups(count, own.data(), threads, [&](const Lanes& rows, Room& room, std::vector<V>&) {
-        Lanes lanes = rows;  // x and the results have a row per entry of `index`, the measurements one per sample
-        for (auto& s : lanes.sample) s = index[s];
-        auto entry = [&](int64_t j) { return fetch({x, n}, rows, j); };
-        const Measured m = measure(*f, lanes, entry, H != nullptr, room);
-        for (int64_t l = 0; l < rows.count; l++) {
-            const int64_t b = rows.sample[l];
-            for (int64_t z = 0; z < Z; z++) {
-                h[b * Z + z] = m.h(z)[l];
-                for (int64_t j = 0; H && j < n; j++) H[(b * Z + z) * n + j] = m.H(z)[j][l];
-            }
-            for (int64_t k = 0; line && k < 3 * P; k++) line[b * 3 * P + k] = m.line[k][l];
-        }
-    });
-}
-
 // The normal equations of samples at x (b, n).
-void torchrod_normal(const Fit* f, const double* x, int64_t count, const Sums* out, int64_t threads) {
+void torchrod_normal(const Task* f, const double* x, int64_t count, const Sums* out, int64_t threads) {
     const int64_t n = f->size;
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>& numbers) {
         const Measured m = measure(*f, lanes, [&](int64_t j) { return fetch({x, n}, lanes, j); }, true, room);
@@ -107,20 +75,20 @@ void torchrod_normal(const Fit* f, const double* x, int64_t count, const Sums* o
 }
 
 // From sums at x (b, n): the cost (b) with the prior's, and the covariance (b, n, n) with a tip residual whose weight is multiplied by
-// `stiffer`; NaN where there is none. Prepared.posterior.
-void torchrod_posterior(const Sums* sums, const double* x, const double* mean, const double* precision, int64_t n, double stiffer,
+// `stiffer`; NaN where there is none. mean and precision: of the prior, (n) or a row per sample.
+void torchrod_posterior(const Sums* sums, const double* x, const Table* mean, const Table* precision, int64_t n, double stiffer,
                         int64_t count, double* covariance, double* cost, int64_t threads) {
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room&, std::vector<V>& numbers) {
         numbers.resize(3 * n * n + n);
         V *A = numbers.data(), *found = A + n * n, total = fetch({sums->cost, 2}, lanes, 0) + fetch({sums->cost, 2}, lanes, 1);
         Mask sound = finite(V{});
         for (int64_t i = 0; i < n; i++) {
-            const V off = mean[i] - fetch({x, n}, lanes, i);
-            total += precision[i] * off * off;
+            const V P = fetch(*precision, lanes, i), off = fetch(*mean, lanes, i) - fetch({x, n}, lanes, i);
+            total += P * off * off;
             for (int64_t j = 0; j <= i; j++) {
                 const V markers = fetch({sums->A, 2 * n * n}, lanes, i * n + j);
                 const V tip = fetch({sums->A, 2 * n * n}, lanes, n * n + i * n + j);
-                A[i * n + j] = markers + stiffer * tip + (i == j ? splat(precision[i]) : V{});
+                A[i * n + j] = markers + stiffer * tip + (i == j ? P : V{});
                 sound &= finite(A[i * n + j]);
             }
         }
@@ -135,7 +103,7 @@ void torchrod_posterior(const Sums* sums, const double* x, const double* mean, c
 }
 
 // One iteration of the filter for the samples `index`.
-void torchrod_iterate(const Fit* f, const Filter* filter, const Sums* out, const int64_t* index, int64_t count, int64_t threads) {
+void torchrod_iterate(const Task* f, const Filter* filter, const Sums* out, const int64_t* index, int64_t count, int64_t threads) {
     in_groups(count, index, threads,
               [&](const Lanes& lanes, Room& room, std::vector<V>& numbers) { iterate(*f, *filter, *out, lanes, room, numbers); });
 }
@@ -147,7 +115,7 @@ void torchrod_filter(const Course* c, const int64_t* index, int64_t count, int64
 
 // The base wrench (b, 6) in equilibrium with the loads of x (b, n), how far it is from that (b), the centre line (b, P, 3) and the
 // base. q_tip (b, 4) or null.
-void torchrod_balance(const Fit* f, const double* x, const double* q_tip, int64_t increments, int64_t count, double tolerance,
+void torchrod_balance(const Task* f, const double* x, const double* q_tip, int64_t increments, int64_t count, double tolerance,
                       double* wrench, double* missed, double* line, int64_t threads) {
     const int64_t n = f->size, numbers_of_line = 3 * f->known.outputs;
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
@@ -182,8 +150,8 @@ void torchrod_perceptron(const Perceptron* p, const float* x, int64_t count, flo
     });
 }
 
-// The cost of (3) at x (b, n) with the prior's: Prepared.cost.
-void torchrod_cost(const Fit* f, const double* x, const double* mean, const double* precision, int64_t count, double* cost,
+// The cost r^T W r at x (b, n) with the prior's.
+void torchrod_cost(const Task* f, const double* x, const Table* mean, const Table* precision, int64_t count, double* cost,
                    int64_t threads) {
     const int64_t n = f->size, P = f->known.outputs - 1, Z = 3 * P + PLAIN;
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
@@ -195,10 +163,21 @@ void torchrod_cost(const Fit* f, const double* x, const double* mean, const doub
             const V square = residual(*f, lanes, m, z, w, r);
             sum += z < 3 * P ? robust_cost(*f, square) : square;
         }
-        for (int64_t i = 0; i < n; i++) sum += precision[i] * (mean[i] - entry(i)) * (mean[i] - entry(i));
+        for (int64_t i = 0; i < n; i++) {
+            const V off = fetch(*mean, lanes, i) - entry(i);
+            sum += fetch(*precision, lanes, i) * off * off;
+        }
         for (int64_t l = 0; l < lanes.count; l++) cost[lanes.sample[l]] = sum[l];
     });
 }
 
 int64_t torchrod_lanes() { return W; }
+
+// layout.h, and what each function takes. bindings.py compares the text with its own.
+const char* torchrod_layout() {
+    static const std::string text = structures_and_constants() + FUNCTION(torchrod_march) + FUNCTION(torchrod_normal) +
+                                    FUNCTION(torchrod_posterior) + FUNCTION(torchrod_iterate) + FUNCTION(torchrod_filter) +
+                                    FUNCTION(torchrod_balance) + FUNCTION(torchrod_perceptron) + FUNCTION(torchrod_cost);
+    return text.c_str();
+}
 }

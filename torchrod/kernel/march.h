@@ -3,7 +3,7 @@
 
 #include <vector>
 
-#include "body.h"
+#include "section_local.h"
 
 // What rk4_step leaves for its tangents: every evaluation's slope and value, the state before q is made a unit again.
 struct Trace {
@@ -12,7 +12,7 @@ struct Trace {
     int64_t row[4];
 };
 
-// step.py, rk4_step: step i of the values.
+// section.py, rk4_step: step i of the values.
 inline void rk4_step(const Group& g, V* y, int64_t i, bool reverse, Trace& t) {
     const Known& m = *g.known;
     Stage stage;
@@ -73,7 +73,7 @@ template <bool Plain, bool Moving> __attribute__((noinline)) void rk4_tangent(co
     for (int c = 0; c < 4; c++) dy[3 + c] = t.inverse * (dy[3 + c] - along * t.unscaled[c]);
 }
 
-// As `walk`, where body.h serves: tangents are carried in the section's own frame and shown in the base frame.
+// As `walk`, where section_local.h serves: tangents are carried in the section's own frame and shown in the base frame.
 template <class Arrive> void walk_in_own_frame(const Group& g, V* y, V* dy, bool reverse, Arrive arrive) {
     const int64_t steps = g.known->steps;
     static thread_local std::vector<V> carried;
@@ -129,3 +129,12 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
         arrive(reverse ? i : i + 1, [] {});
     }
 }
+
+// States at the outputs and their tangents, of which the first load_tangents also move the local loads by dlocal.
+struct March {
+    Known known;
+    int64_t batch, tangents, load_tangents, reverse;
+    const double *y0, *dy0;        // (B, 13), (B, 13, n)
+    const double *local, *dlocal;  // (B, S, 3, 6) = [G, G2], (B, S, 3, 6, load_tangents), or null
+    double *out, *dout;            // (B, P, 13), (B, P, 13, n)
+};

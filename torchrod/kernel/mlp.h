@@ -5,7 +5,7 @@
 
 #include <vector>
 
-#include "known.h"
+#include "simd.h"
 
 typedef float F __attribute__((vector_size(W * sizeof(double))));  // 2 W samples
 typedef int32_t Bits __attribute__((vector_size(W * sizeof(double))));
@@ -23,7 +23,7 @@ INLINE F splat_single(float x) {
     return r;
 }
 
-// exp(-z^2) to 2e-7: as `exponential` in lanes.h.
+// exp(-z^2) to 2e-7: as `exponential` in simd.h.
 INLINE F bell_single(F z) {
     const F square = z * z, x = -(square < 80.0f ? square : splat_single(80.0f));
     const F shifted = x * 1.44269504f + 0x1.8p23f, n = shifted - 0x1.8p23f;

@@ -1,17 +1,9 @@
-// One arc-length step's right-hand side and its slope: the same operations as torchrod/mechanics/section.py and torchrod/mechanics/tendons.py, and their
-// derivative. The torch step is the definition; tests/test_fast.py and test_fit.py hold this copy to it, values and Jacobians.
+// One arc-length step's right-hand side and its slope: the same operations as torchrod/mechanics/section.py and
+// torchrod/mechanics/tendons.py, and their derivative. The torch step is the definition; tests/test_fast.py and test_fit.py hold this
+// copy to it, values and Jacobians.
 #pragma once
 
-#include "known.h"
-
-constexpr int MOST_TENDONS = 16;
-
-// All that is known at one stage, for the samples in the lanes.
-struct Stage {
-    bool Wn_there, Wm_there;
-    V3 G, Gm, Wn, Wm, u_star;
-    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
-};
+#include "tables.h"
 
 INLINE void inverse3(const V* A, V* R) {  // rows of R: cofactors of the columns of A
     V c[9] = {A[4] * A[8] - A[7] * A[5], A[7] * A[2] - A[1] * A[8], A[1] * A[5] - A[4] * A[2],
@@ -102,7 +94,7 @@ struct Slope {
     Balance balance;
 };
 
-// step.py, derivative: (1)-(4). The parts of the wrench that turn with the section come first; what keeps its direction in the
+// section.py, derivative: (1)-(4). The parts of the wrench that turn with the section come first; what keeps its direction in the
 // base frame is added to them.
 inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope& s) {
     s.q = part(y + 3), s.w = y[6];

@@ -1,14 +1,11 @@
 """Walk the arc-length step along the rod, and carry tangents with it.
 
 `march` is the definition, in torch, for any transform. `march_linearized` returns the states at chosen nodes together with their
-derivatives along given tangents: by the compiled kernel where it serves (torchrod.kernel), else by torch.func on
-each step, which torch.compile can trace. All differentiate the discrete steps, so they agree to round-off.
+derivatives along given tangents: by the compiled kernel where it serves (torchrod.kernel), else by torch.func. Both differentiate
+the discrete steps, so they agree to round-off.
 """
 
-import os
-from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
@@ -88,59 +85,25 @@ def march_linearized(
         local = None if (G := table.loads.G) is None or (G2 := table.loads.G2) is None else torch.cat([G, G2], -1)
         local = None if local is None else local.expand(len(y0), -1, 3, 6)
         return kernel.march_linearized(tensors, numbers, local, dlocal, y0, dy0, reverse)
-    n, h = dy0.shape[-1], grid.h
-    table = table.reversed() if reverse else table
-    if dlocal is not None:
-        dlocal = torch.nn.functional.pad(dlocal, (0, n - dlocal.shape[-1])).movedim(-1, 0)
-        dlocal = dlocal.flip(-2) if reverse else dlocal
-    y, dy, steps = y0, dy0.movedim(-1, 0), range(h.shape[-1])
-    states, tangents = [y], [dy]
-    for i in reversed(steps) if reverse else steps:
-        length = (-h[..., i] if reverse else h[..., i]).expand(y.shape[:-1])
-        dG = None if dlocal is None else dlocal[:, :, i]
-        y, dy = _step()(section, y, dy, table.step(i), dG, length) if n else (rk4_step(section, y, table.step(i), length), dy)
-        states.append(y)
-        tangents.append(dy)
-    if reverse:
-        states, tangents = states[::-1], tangents[::-1]
-    kept = states_at(torch.stack(tangents, -2).movedim(0, -1).flatten(-2), keep)
-    return states_at(torch.stack(states, -2), keep), kept.unflatten(-1, (13, n))
+    n, loads = dy0.shape[-1], table.loads
+    G, G2 = loads.G, loads.G2
 
+    def walk(y0: State, *local: Vector) -> Float[Tensor, "B P 13"]:
+        moved = replace(table, loads=replace(loads, G=local[0], G2=local[1])) if local else table
+        return states_at(march(section, y0, moved, grid, reverse), keep)
 
-def step_with_tangents(
-    section: Section,
-    y: State,
-    dy: Float[Tensor, "n B 13"],
-    table: StageTable,
-    dlocal: Float[Tensor, "n B 3 6"] | None,
-    h: Float[Tensor, " B"],
-) -> tuple[State, Float[Tensor, "n B 13"]]:
-    """One step and its derivatives along n tangents, which move the state by dy and the local loads [G, G2] by dlocal."""
-    known = table.loads
+    if n == 0:
+        states = walk(y0)
+        return states, states.new_empty(*states.shape, 0)
+    at, along = (y0,), (dy0.movedim(-1, 0),)
+    if dlocal is not None and G is not None and G2 is not None:
+        moves = torch.nn.functional.pad(dlocal, (0, n - dlocal.shape[-1])).movedim(-1, 0)
+        at = (y0, *(x.expand(len(y0), *x.shape[-3:]) for x in (G, G2)))
+        along = (*along, moves[..., :3], moves[..., 3:])
 
-    def column(dy: State, d: Float[Tensor, "B 3 6"] | None) -> tuple[State, State]:
-        if d is None or known.G is None or known.G2 is None:
-            value, tangent, *_ = jvp(lambda y: rk4_step(section, y, table, h), (y,), (dy,))
-            return value, tangent
-
-        def step(y: State, G: Vector, G2: Vector) -> State:
-            return rk4_step(section, y, replace(table, loads=replace(known, G=G, G2=G2)), h)
-
-        # Copies: torch.compile asserts that a dual number's parts lie alike in memory.
-        at = [x.expand(*y.shape[:-1], 3, 3).clone() for x in (known.G, known.G2)]
-        value, tangent, *_ = jvp(step, (y, *at), (dy, d[..., :3].clone(), d[..., 3:].clone()))
+    def column(*tangents: Tensor) -> tuple[Tensor, Tensor]:
+        value, tangent, *_ = jvp(walk, at, tangents)
         return value, tangent
 
-    axes = (0, None if dlocal is None else 0)
-    return vmap(column, in_dims=axes, out_dims=(None, 0))(dy, dlocal)  # pyright: ignore[reportArgumentType]
-
-
-@lru_cache(maxsize=1)
-def _step() -> Callable[..., tuple[State, Float[Tensor, "n B 13"]]]:
-    """step_with_tangents, compiled whole by torch.compile where TORCHROD_COMPILE names a backend (inductor).
-
-    That is the path that needs no kernel of ours; on a CPU torch's own compiler wants a C++ compiler too. A minute or more for each
-    new batch size, robot and family of loads, kept in torch's cache on disk, then 14 times as fast or more (docs/performance.md).
-    """
-    backend = os.environ.get("TORCHROD_COMPILE", "")
-    return torch.compile(step_with_tangents, fullgraph=True, dynamic=False, backend=backend) if backend else step_with_tangents
+    states, tangents = vmap(column, out_dims=(None, 0))(*along)  # pyright: ignore[reportArgumentType]
+    return states, tangents.movedim(0, -1)

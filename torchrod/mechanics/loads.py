@@ -120,13 +120,9 @@ class GaussianLoads(Float64):
         """The paper's (13): a sqrt(pi / c), N, as if the whole Gaussian lay on the rod."""
         return self.a * (math.pi / self.c).sqrt().unsqueeze(-1)
 
-    def fraction_on_rod(self, length: float) -> Float[Tensor, "... K"]:
-        """The part of each Gaussian that lies in [0, L]: what (13) leaves out."""
-        return on_rod_fraction(self.mu, self.c, length)
-
 
 def on_rod_fraction(mu: Float[Tensor, "... K"], c: Float[Tensor, "... K"], length: float) -> Float[Tensor, "... K"]:
-    """(erf(sqrt(c) (L - mu)) + erf(sqrt(c) mu)) / 2."""
+    """The part of each Gaussian that lies in [0, L], which (13) leaves out: (erf(sqrt(c) (L - mu)) + erf(sqrt(c) mu)) / 2."""
     return 0.5 * (torch.erf(c.sqrt() * (length - mu)) + torch.erf(c.sqrt() * mu))
 
 

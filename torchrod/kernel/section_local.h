@@ -1,7 +1,7 @@
 // One arc-length step in the frame of the section at its beginning: where nothing acts in the base frame and the section is round
 // (no tendons, no weight, diagonal stiffness), half the work of the tangents of section.h, to the same numbers.
 //
-// (1) Within a step from q (|q| = 1) write the orientation of stage i as q e_i. step.py's rate q' = q (u, 0) / 2 is linear in q, and
+// (1) Within a step from q (|q| = 1) write the orientation of stage i as q e_i. section.py's rate q' = q (u, 0) / 2 is linear in q, and
 //     its R(q e) = R(q) R(e), so that for the classical Runge-Kutta step of length h, with u_i as quaternions of no real part,
 //         e_1 = 1,  e_2 = 1 + h/4 e_1 u_1,  e_3 = 1 + h/4 e_2 u_2,  e_4 = 1 + h/2 e_3 u_3,
 //         E = 1 + h/12 (e_1 u_1 + 2 e_2 u_2 + 2 e_3 u_3 + e_4 u_4),   P = h/6 sum w_i e_i v_i e_i*,   w = (1, 2, 2, 1),
@@ -18,7 +18,7 @@
 //     every tangent's k be a product with a matrix that has its share of h in it.
 #pragma once
 
-#include "group.h"
+#include "section.h"
 
 constexpr int CARRIED = 12;  // of a tangent in the section's own frame: dN~, dM~, theta, pi
 

@@ -1,12 +1,13 @@
-// What the markers show of a rod, and the normal equations: the compiled copy of Model.h, of the loads it is made of, and of
-// starts.residual_and_cost and ekf.normal_equations.
+// What the markers show of a rod, and the normal equations: the compiled copy of h(x) of torchrod/model, and of `normal_equations`
+// and `student` in torchrod/estimation/filter.py.
 #pragma once
 
 #include "loads.h"
 
 constexpr int PLAIN = 6;  // rows of the tip residual
 
-struct Fit {
+// What is fitted: the robot on its grid, its loads, the unknowns and their units, and the measurements of all samples.
+struct Task {
     Known known;
     Loads loads;
     int64_t size, tip, tensions, registration;  // entries of x in all, of the unknown wrench at the tip, of free tensions; flag
@@ -71,7 +72,7 @@ struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the cen
     V* H(int64_t z) const { return rows + z * width + 1; }
 };
 
-template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, bool slopes, Room& room) {
+template <class X> Group group_of(const Task& f, const Lanes& lanes, X x, bool slopes, Room& room) {
     const Known& m = f.known;
     const int64_t g = f.loads.size;
     room.tension.resize(f.tensions);
@@ -94,7 +95,7 @@ template <class X> Group group_of(const Fit& f, const Lanes& lanes, X x, bool sl
 
 // Writes what one output shows: rows of h, and of dh/dx for every tangent, the j-th of which is column(j) of x.
 template <class X> struct Show {
-    const Fit& f;
+    const Task& f;
     const Group& g;
     X x;
     const Motion& motion;
@@ -167,7 +168,7 @@ template <class X> struct Show {
 };
 
 // h and H of the samples in the lanes. x(j): entry j of their states. Without `slopes` h alone.
-template <class X> Measured measure(const Fit& f, const Lanes& lanes, X x, bool slopes, Room& room) {
+template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool slopes, Room& room) {
     const Known& m = f.known;
     const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
     const int64_t width = slopes ? 1 + n : 1;
@@ -220,7 +221,7 @@ INLINE void accumulate(const Measured& m, int64_t z, int64_t rows, const V* w, c
 }
 
 // r = z - h of three rows, zero where a marker is missing, and their weights. Returns r^T W r.
-INLINE V residual(const Fit& f, const Lanes& lanes, const Measured& m, int64_t z, V* w, V* r) {
+INLINE V residual(const Task& f, const Lanes& lanes, const Measured& m, int64_t z, V* w, V* r) {
     const int64_t P = f.known.outputs - 1, Z = 3 * P + PLAIN;
     V square = V{};
     for (int k = 0; k < 3; k++) {
@@ -232,14 +233,14 @@ INLINE V residual(const Fit& f, const Lanes& lanes, const Measured& m, int64_t z
     return square;
 }
 
-INLINE V robust_cost(const Fit& f, V square) {
+INLINE V robust_cost(const Task& f, V square) {
     if (!std::isfinite(f.robust)) return square;
     return (f.robust + 3) * each(square / f.robust, [](double a) { return std::log1p(a); });
 }
 
 // r takes the place of h. With Student's t of `robust` degrees of freedom each marker's weight is multiplied by
-// (nu + 3) / (nu + s), s = r^T W r of that marker, and its cost is (nu + 3) log(1 + s / nu): ekf.py, student_weights.
-inline Normal normal_equations(const Fit& f, const Lanes& lanes, const Measured& m, V* room) {
+// (nu + 3) / (nu + s), s = r^T W r of that marker, and its cost is (nu + 3) log(1 + s / nu): `student` in estimation/filter.py.
+inline Normal normal_equations(const Task& f, const Lanes& lanes, const Measured& m, V* room) {
     const int64_t n = f.size, P = f.known.outputs - 1, Z = 3 * P + PLAIN;
     Normal N{{room, room + n * n}, {room + 2 * n * n, room + 2 * n * n + n}, {V{}, V{}}, V{}};
     for (int64_t i = 0; i < 2 * n * n + 2 * n; i++) room[i] = V{};

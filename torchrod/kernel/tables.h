@@ -1,9 +1,60 @@
-// The samples of one group, and what is known at a stage of a step for them.
+// What is known before a march: tables that the batch shares or that have one row per sample, the samples of one group, and what is
+// known at a stage of a step for them.
 #pragma once
 
-#include "section.h"
+#include "simd.h"
 
+constexpr int MOST_TENDONS = 16;
 constexpr int STATE = 13, PARTS = 5;  // of the state p, q, N~, M~; of a local load: G_x, G_y, G_z, G2_x, G2_y
+
+struct Table {  // null where there is none; stride 0: shared, else numbers per sample
+    const double* data;
+    int64_t stride;
+};
+
+struct Places {  // integers, likewise
+    const int64_t* data;
+    int64_t stride;
+};
+
+struct Known {
+    int64_t steps, tendons, newton, diagonal;
+    const double *K_se, *K_bt, *K_se_inverse, *K_bt_inverse;  // 9 each
+    Table h;                                                  // (S)
+    Table Gm, Wn, Wm, u_star;                                 // (S, 3, 3)
+    Table L, dr, tau;                                         // (S, 3, T, 18), (S, 3, T, 3), (S, 3, T)
+    Places at;                                                // (P) nodes of the outputs
+    int64_t outputs;
+};
+
+// The samples in the lanes; lanes beyond `count` repeat the first sample and are not stored.
+struct Lanes {
+    int64_t sample[W], count;
+};
+
+INLINE V fetch(const Table& t, const Lanes& lanes, int64_t k) {
+    if (t.stride == 0) return splat(t.data[k]);
+    V r;
+    for (int i = 0; i < W; i++) r[i] = t.data[lanes.sample[i] * t.stride + k];
+    return r;
+}
+INLINE Mask reached(const Places& t, const Lanes& lanes, int64_t k, int64_t node) {
+    Mask r;
+    for (int i = 0; i < W; i++) r[i] = t.data[lanes.sample[i] * t.stride + k] == node ? -1 : 0;
+    return r;
+}
+INLINE bool any(Mask m) {
+    int64_t r = 0;
+    for (int i = 0; i < W; i++) r |= m[i];
+    return r != 0;
+}
+
+// All that is known at one stage, for the samples in the lanes.
+struct Stage {
+    bool Wn_there, Wm_there;
+    V3 G, Gm, Wn, Wm, u_star;
+    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
+};
 
 // One group of samples. Tangents are ordered [loads | tensions | the rest]; only the first two move what is known along the rod.
 struct Group {
@@ -20,7 +71,7 @@ struct Group {
     bool stretching = false;  // whether a first tangent may change |q|, which only the step in the base frame can carry
     bool turning = true;      // whether anybody asks how q moves at the outputs
 
-    bool in_own_frame() const {  // whether body.h serves
+    bool in_own_frame() const {  // whether section_local.h serves
         return known->diagonal && !known->tendons && !known->Wn.data && !known->Wm.data && !node_moves && !stretching;
     }
     const V* local_at(int64_t row) const { return local ? local + row * (1 + load_tangents) * PARTS : nullptr; }

@@ -2,7 +2,7 @@
 // its damping, for loads and tensions that are known. tests/test_equilibrium.py holds it to that.
 #pragma once
 
-#include "measure.h"
+#include "sensors.h"
 
 constexpr int MOST_TURNS = 12;         // of the tip; what has not settled by then is left to statics.py
 constexpr double ON_THE_WAY = 1e-3;  // rad: enough before all of the load is on
@@ -22,7 +22,7 @@ inline void turn_by(const V3& w, V* q) {
 }
 
 // One walk from the tip, which carries no more than the loads that act on it, to the base; y is the state there.
-inline void walk_to_base(const Fit& f, const Group& g, const V* q, V* y, V* dy, V* line) {
+inline void walk_to_base(const Task& f, const Group& g, const V* q, V* y, V* dy, V* line) {
     const V* beyond = g.local_at(3 * f.known.steps);
     for (int i = 0; i < STATE; i++) y[i] = V{};
     for (int i = 0; i < 4; i++) y[3 + i] = q[i];
@@ -47,7 +47,7 @@ inline void walk_to_base(const Fit& f, const Group& g, const V* q, V* y, V* dy, 
 // q_tip: where to look for the tip's orientation (4), with all of the base frame's loads on, or null: from where it is without them,
 // putting them on in so many increments.
 template <class X>
-Balanced balanced(const Fit& f, const Lanes& lanes, X x, const V* q_tip, int64_t increments, double tolerance, Room& room) {
+Balanced balanced(const Task& f, const Lanes& lanes, X x, const V* q_tip, int64_t increments, double tolerance, Room& room) {
     Group g = group_of(f, lanes, x, false, room);
     const bool dead = f.known.Wn.data;
     V q[4] = {V{}, V{}, V{}, splat(1.0)}, y[STATE], dy[3 * STATE];
