@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from ablations.cases import Case
-from ablations.measure import Run, compared
+from studies.ablation.cases import Case
+from studies.ablation.measure import Run, compared
 
 pytestmark = pytest.mark.many_fits
 ROOT = Path(__file__).resolve().parents[1]

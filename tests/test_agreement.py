@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ablations.plans import make, reference_parts
+from studies.ablation.plans import make, reference_parts
 
 from tests.test_fast import needs_compiler
 from torchrod import cold_start, estimate, kernel

@@ -3,9 +3,9 @@
 import json
 import math
 
-import contacts
 import pytest
 import torch
+from studies import contacts
 
 from tests.robots import T, steel_rod
 from torchrod import GaussianCoordinates, GaussianLoads, Markers, Model, PointForces, PointWrenches, estimate, solve_shape

@@ -2,7 +2,7 @@
 
 import pytest
 from matplotlib.figure import Figure
-from trusting import coverage, frame, markers, mistakes, unknown_noise
+from studies.trust import coverage, frame, markers, mistakes, unknown_noise
 
 from torchrod import Estimate
 

@@ -164,7 +164,7 @@ def _lines(n: Tensor, w: dict[str, Tensor], d: dict[str, float]) -> list[str]:
         f"{d['shear_off']:.0e}). Slopes in log-log: supported {d['supported_slope']:.3f}; cantilever {d['clamped_slope']:.2f} over",
         f"n = 2..10 ({d['clamped_slope_from_n_1']:.2f} from n = 1, where the two terms of the closed form are still of one size).",
         "A cantilever filters far less: its clamp carries the load's moment, which falls like 1/n",
-        "(scripts/reproduction/sinusoids.py derives it), so (5) does not hold for a robot clamped at its base.",
+        "(scripts/studies/reproduction/sinusoids.py derives it), so (5) does not hold for a robot clamped at its base.",
         "",
         "![RMS deflection against the number of half waves: 1/n^4 on simple supports, 1/n as a cantilever](figure2.png)",
         "",

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from peers import Problem
-from reproduction.cases import steel_rod
 
+from studies.peers import Problem
+from studies.reproduction.cases import steel_rod
 from torchrod import GaussianCoordinates, Model, PointForces, solve_shape
 from torchrod.mechanics.statics import grid_for
 from torchrod.model.measurement import TURN_SCALE
