@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 import torchrod
 from torchrod import kernel
+from torchrod.util.threads import one_thread
 
 from .cases import COLUMNS, Recipe, block
 
@@ -33,14 +34,8 @@ def make_block(recipe: Recipe, folder: Path, index: int) -> None:
     kernel.library(wait=True)
     path = folder / f"{index:04d}.safetensors"
     part = path.with_suffix(f".{os.getpid()}")
-    before = torch.get_num_threads(), torch.get_default_dtype()
-    torch.set_num_threads(1)
-    torch.set_default_dtype(torch.float64)
-    try:
+    with one_thread(kernel=True):
         save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
-    finally:
-        torch.set_num_threads(before[0])
-        torch.set_default_dtype(before[1])
     part.replace(path)
 
 
