@@ -9,6 +9,10 @@ import torch
 
 from torchrod import kernel
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # one thread per worker, and per process that it starts: the workers share the cores
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "third_party"
 
 

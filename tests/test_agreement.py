@@ -27,6 +27,7 @@ def parts(name: str):
 
 
 @pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.study
 def test_both_paths_find_the_same_loads(name, monkeypatch):
     for part in parts(name):
         assert len(part.markers.positions) <= CHUNK_TORCH

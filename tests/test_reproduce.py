@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_quick_reproduction(tmp_path):
     command = [
         sys.executable,

@@ -119,6 +119,7 @@ def train(folder: Path, name: str, *options: str) -> Path:
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_a_small_run_repeats_itself_and_resumes(tmp_path):
     threads = torch.get_num_threads()
     try:

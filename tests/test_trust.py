@@ -6,7 +6,7 @@ from studies.trust import coverage, frame, markers, mistakes, unknown_noise
 
 from torchrod import Estimate
 
-pytestmark = pytest.mark.many_fits
+pytestmark = [pytest.mark.many_fits, pytest.mark.study]
 
 
 def test_coverage_of_a_contact():
