@@ -316,21 +316,32 @@ def _api(robot: str) -> tuple[Callable[..., object], Callable[[], Callable[[np.n
 
     import torchrod as tr
 
-    model_of = getattr(tr, "Problem", None)
-    if model_of is not None:
-        raise SystemExit("compare.py: this checkout has torchrod.Problem; add its names to _api, beside those of before")
-    read = tr.read_robot(robot)
-    model = tr.Model(read, tr.GaussianCoordinates(1, read.rod.length, read.rod.force_scale, "contact"))
+    here: Any = tr  # the names differ from checkout to checkout
+    read = here.read_robot(robot)
+    load = here.GaussianCoordinates(1, read.rod.length, read.rod.force_scale, "contact")
     s = torch.linspace(0.02, 0.4, 20)
+    if hasattr(here, "Problem"):
+        unknowns = here.Unknowns(load)
 
-    def estimate(s: Any, positions: np.ndarray, noise: float, **settings: Any) -> object:
-        return tr.estimate(model, tr.Markers(s, torch.from_numpy(positions)), noise, tr.Settings(**settings))
+        def estimate(s: Any, positions: np.ndarray, noise: float, **settings: Any) -> object:
+            markers = here.Markers(s, torch.from_numpy(positions), noise)
+            return here.estimate(here.Problem(read, unknowns, [markers]), here.Settings(**settings))
 
-    def follow() -> Callable[[np.ndarray], object]:
-        estimator = tr.Estimator(model, s.double(), NOISE)
+        def follow() -> Callable[[np.ndarray], object]:
+            tracker = here.Tracker(read, unknowns, s.double(), NOISE)
+            return lambda positions: tracker(torch.from_numpy(positions))
+
+        return estimate, follow, s
+    model = here.Model(read, load)
+
+    def estimate_before(s: Any, positions: np.ndarray, noise: float, **settings: Any) -> object:
+        return here.estimate(model, here.Markers(s, torch.from_numpy(positions)), noise, here.Settings(**settings))
+
+    def follow_before() -> Callable[[np.ndarray], object]:
+        estimator = here.Estimator(model, s.double(), NOISE)
         return lambda positions: estimator(torch.from_numpy(positions))
 
-    return estimate, follow, s
+    return estimate_before, follow_before, s
 
 
 # No sample comes near its minimum in so few short steps, so that every one of them takes part in every iteration.

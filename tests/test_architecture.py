@@ -1,7 +1,6 @@
 """The house rules that a machine can check."""
 
 import ast
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -97,8 +96,7 @@ markers = Markers(s, shape.p, 0.01 * torch.ones(4, 3), tension)
 fit = estimate(model, markers, 1e-3, Settings(max_iterations=2))
 print(fit.magnitude_std, fit.rms_residual, fit.fit(0).loads(0.4))
 """
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "scripts")])}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]
 
 

@@ -16,7 +16,7 @@ from torchrod.estimation.evaluator import Prepared
 BEGIN = """
 import os, threading
 import torch
-from torchrod import fast
+from torchrod import kernel
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)
 from tests import test_crew
