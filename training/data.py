@@ -34,8 +34,13 @@ def make_block(recipe: Recipe, folder: Path, index: int) -> None:
     kernel.library(wait=True)
     path = folder / f"{index:04d}.safetensors"
     part = path.with_suffix(f".{os.getpid()}")
-    with one_thread(kernel=True):
-        save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)  # the smoothing of a learned start's features follows it, by 1e-8
+    try:
+        with one_thread(kernel=True):
+            save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
+    finally:
+        torch.set_default_dtype(before)
     part.replace(path)
 
 

@@ -8,7 +8,8 @@ from typing import Any, NoReturn
 
 from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace
 
-from .. import __version__
+import torchrod
+
 from ..util.errors import InputError
 
 
@@ -170,7 +171,7 @@ HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
 
 def _parser() -> ArgumentParser:
     about = "Forces from shape: the loads on a continuum robot from its measured markers."
-    parser = _Parser(prog="torchrod", description=about, version=__version__)
+    parser = _Parser(prog="torchrod", description=about, version=torchrod.__version__)
     commands = parser.add_subcommands(required=True)
     for name, (make, help) in COMMANDS.items():
         commands.add_subcommand(name, make(), help=help)

@@ -91,7 +91,7 @@ def kriging(s: Float[Tensor, " P"], seen: Bool[Tensor, "U P"], sigma: float) -> 
     grid = torch.linspace(1 / GRID, 1, GRID, dtype=DTYPE)
     at_markers, at_grid, bend = _beam(s, t)[0], _beam(grid, t)[0], _beam(grid - 1 / GRID, t)[1]
     q2 = LOAD_STD**2 / NODES
-    variance = torch.where(seen, torch.tensor(sigma**2, dtype=DTYPE), MISSING_VARIANCE)  # of two numbers it would be float32
+    variance = torch.where(seen, sigma**2, MISSING_VARIANCE)
     factor = torch.linalg.cholesky(q2 * at_markers @ at_markers.T + torch.diag_embed(variance))
     cross = q2 * at_markers @ torch.cat([at_grid, bend]).T
     return torch.cholesky_solve(cross.expand(len(seen), -1, -1), factor).mT
