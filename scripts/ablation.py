@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from ablations.measure import REPEATS, STARTS, compared, runs, start_times
-from ablations.plans import PLANS, make
-from ablations.report import figure, page
+from studies.ablation.measure import REPEATS, STARTS, compared, runs, start_times
+from studies.ablation.plans import PLANS, make
+from studies.ablation.report import figure, page
 from tqdm import tqdm
 
 

@@ -12,11 +12,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import peers
-from benchmarks.agreement import Disagreement, checked
-from benchmarks.bars import bars, ratios
-from benchmarks.figure import figure
-from benchmarks.measure import (
+from studies import peers
+from studies.benchmark.agreement import Disagreement, checked
+from studies.benchmark.bars import bars, ratios
+from studies.benchmark.figure import figure
+from studies.benchmark.measure import (
     by_batch,
     by_cores,
     command_line,
@@ -29,9 +29,9 @@ from benchmarks.measure import (
     single,
     workers,
 )
-from benchmarks.plans import FULL, QUICK, Plan
-from benchmarks.processes import TORCHROD, available
-from benchmarks.report import generated, write_page
+from studies.benchmark.plans import FULL, QUICK, Plan
+from studies.benchmark.processes import TORCHROD, available
+from studies.benchmark.report import generated, write_page
 from tqdm import tqdm
 
 ROOT = Path(__file__).resolve().parents[1]

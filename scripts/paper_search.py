@@ -1,7 +1,7 @@
 """Search for the tuning that the paper does not print: python scripts/paper_search.py [--count N] [--out FILE].
 
 The recursion (4) in the paper's coordinates has no safeguard, and Q, Sigma_0, W of the tip, the start and the range of (11) decide
-how often it converges. Each row of FILE (scripts/reproduction/paper_search.csv) is one choice of
+how often it converges. Each row of FILE (scripts/studies/reproduction/paper_search.csv) is one choice of
 
     a, eta, c, n, m    standard deviations of Q's entries: of a (N/m), eta, c (1/m^2), n(0) (N) and m(0) (N m)
     ratio              Sigma_0 = ratio^2 Q
@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from reproduction.cases import L, Study, study1
-from reproduction.paper_mode import STRICT, TABLE, rank, unlike
-from reproduction.study1 import figures_of
+from studies.reproduction.cases import L, Study, study1
+from studies.reproduction.paper_mode import STRICT, TABLE, rank, unlike
+from studies.reproduction.study1 import figures_of
 from tqdm import tqdm
 
 from torchrod import Model, PaperCoordinates, estimate, paper_settings

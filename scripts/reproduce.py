@@ -1,6 +1,6 @@
 """The paper's studies, figures and tables beside ours: python scripts/reproduce.py [PART ...] [--quick] [--json FILE] [--out DIR].
 
-Each part is a module in scripts/reproduction with run(quick, folder) -> (figures as data, lines of Markdown). The parts that ran
+Each part is a module in studies/reproduction with run(quick, folder) -> (figures as data, lines of Markdown). The parts that ran
 are written to DIR/reproduction.md with their pictures, and to FILE as JSON. DIR is docs/ for a run of everything, out/ for a quick
 or partial one, so that it does not take the full page's place.
 """
@@ -10,8 +10,8 @@ import json
 import textwrap
 from pathlib import Path
 
-from reproduction import coverage, errata, sensitivity, sinusoids, study1, study2, tables
-from reproduction.summary import summary
+from studies.reproduction import coverage, errata, sensitivity, sinusoids, study1, study2, tables
+from studies.reproduction.summary import summary
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = {

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from trusting import coverage, frame, markers, mistakes, unknown_noise
+from studies.trust import coverage, frame, markers, mistakes, unknown_noise
 
 
 def main() -> None:

@@ -2,9 +2,9 @@
 
     python scripts/validate.py [--quick] [--json FILE] [--out FOLDER]
 
-Each part is a module in scripts/validation with run(quick, folder) -> (figures as data, lines of Markdown). FOLDER/validation.md
-(docs/ by default, out/ with --quick) gets the summary, the sections and their pictures; FILE the figures as JSON. A part whose
-data are not at hand is skipped, and the page and the screen say so.
+Each part is a module in scripts/studies/validation with run(quick, folder) -> (figures as data, lines of Markdown).
+FOLDER/validation.md (docs/ by default, out/ with --quick) gets the summary, the sections and their pictures; FILE the figures as
+JSON. A part whose data are not at hand is skipped, and the page and the screen say so.
 """
 
 import argparse
@@ -15,8 +15,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from validation import beam, elastica, shapes, sorosim, tendons
-from validation.common import ROOT, SkippedError, summary_line
+from studies.validation import beam, elastica, shapes, sorosim, tendons
+from studies.validation.common import ROOT, SkippedError, summary_line
 
 PARTS = {"sorosim": sorosim, "tendons": tendons, "elastica": elastica, "beam": beam, "shapes": shapes}
 HEAD = """# Validation

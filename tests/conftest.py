@@ -9,6 +9,14 @@ import torch
 
 from torchrod import kernel
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # one thread per worker, and per process that it starts: the workers share the cores
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+
+# A process that a test starts finds the tests and the studies where the test does.
+ROOT = Path(__file__).resolve().parents[1]
+os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(ROOT / "scripts"), *filter(None, [os.environ.get("PYTHONPATH")])])
+
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "third_party"
 
 

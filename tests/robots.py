@@ -3,15 +3,13 @@
 import math
 
 import torch
+from studies.reproduction.cases import steel_rod
 
 from torchrod import GaussianLoads, PointForces, Robot, Rod, Tendon, Tendons
 
+__all__ = ["T", "busy_robot", "csv_of", "loads_of", "robot_of", "steel_rod", "toml_of"]
+
 T = torch.tensor
-
-
-def steel_rod() -> Robot:
-    """The paper's rod."""
-    return Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9))
 
 
 def busy_robot() -> Robot:

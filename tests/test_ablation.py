@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from ablations.cases import Case
-from ablations.measure import Run, compared
+from studies.ablation.cases import Case
+from studies.ablation.measure import Run, compared
 
-pytestmark = pytest.mark.many_fits
+pytestmark = [pytest.mark.many_fits, pytest.mark.study]
 ROOT = Path(__file__).resolve().parents[1]
 CASES = ("study1_1mm", "nitinol", "one_tendon", "reference")
 STARTS = {"cold", "warm", "oracle"}

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ablations.plans import make, reference_parts
+from studies.ablation.plans import make, reference_parts
 
 from tests.test_fast import needs_compiler
 from torchrod import cold_start, estimate, kernel
@@ -27,6 +27,7 @@ def parts(name: str):
 
 
 @pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.study
 def test_both_paths_find_the_same_loads(name, monkeypatch):
     for part in parts(name):
         assert len(part.markers.positions) <= CHUNK_TORCH

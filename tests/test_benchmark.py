@@ -4,18 +4,18 @@ import json
 from pathlib import Path
 
 import numpy as np
-import peers
 import pytest
-from benchmarks.agreement import Disagreement, Tolerance, fit_differences, linear_differences, verify
-from benchmarks.bars import bars, ratios, straight
-from benchmarks.cases import ITERATION, STUDY, write, write_frames
-from benchmarks.figure import figure
-from benchmarks.measure import steady
-from benchmarks.plans import FULL, QUICK, WHOLE
-from benchmarks.processes import Process
-from benchmarks.report import BEGIN, END, generated, write_page
-from benchmarks.torchrod_path import TorchrodPeer, kernel_seconds
-from benchmarks.worker import Worker, timed
+from studies import peers
+from studies.benchmark.agreement import Disagreement, Tolerance, fit_differences, linear_differences, verify
+from studies.benchmark.bars import bars, ratios, straight
+from studies.benchmark.cases import ITERATION, STUDY, write, write_frames
+from studies.benchmark.figure import figure
+from studies.benchmark.measure import steady
+from studies.benchmark.plans import FULL, QUICK, WHOLE
+from studies.benchmark.processes import Process
+from studies.benchmark.report import BEGIN, END, generated, write_page
+from studies.benchmark.torchrod_path import TorchrodPeer, kernel_seconds
+from studies.benchmark.worker import Worker, timed
 
 import torchrod
 from torchrod import Estimate, kernel
@@ -117,7 +117,7 @@ def test_a_share_of_work_is_the_same_in_batches_of_every_size(folder, monkeypatc
     worker, path = Worker("torchrod"), str(write(ITERATION, folder))
     assert worker.share(path, 16, 64)["seconds"] > 0
     calls = []
-    monkeypatch.setattr("benchmarks.worker.clocked", lambda once: calls.append(once()) or 0.5)
+    monkeypatch.setattr("studies.benchmark.worker.clocked", lambda once: calls.append(once()) or 0.5)
     assert worker.share(path, 16, 64)["seconds"] == 2.0 and len(calls) == 4
     assert worker.share(path, 64, 64)["seconds"] == 0.5
     assert worker.share(str(write(STUDY, folder)), 32, 64, whole=True)["seconds"] == 1.0

@@ -129,6 +129,7 @@ def test_offsets_at_the_kink_of_a_slack_tendon():
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_the_interval_of_log_mass_covers(monkeypatch):
     """200 repeats of two shapes with three markers: 90 to 99 % of the 95 % intervals hold the truth."""
     solve, known = UnloadedShapes.seen, {}

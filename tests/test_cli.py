@@ -19,6 +19,7 @@ from tests.robots import csv_of, toml_of
 from torchrod import Model, PointCoordinates, bounds, estimate, read_robot, read_shapes
 from torchrod.analysis.marker_placement import even_layout
 from torchrod.cli import main
+from torchrod.cli.parser import COMMANDS
 from torchrod.cli.table import _pairs
 from torchrod.plotting.observability import Layout, draw_observability
 from torchrod.util.progress import bar
@@ -193,6 +194,15 @@ def test_help_imports_neither_torch_nor_lightning(option):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert ("estimate" if option == "--help" else version("torchrod")) in done.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_speaks_of_the_command_and_not_of_python(command):
+    said = COMMANDS[command][0]().format_help()
+    for word in ("lambda", "<", "%", "null", "None", "type:", "False"):
+        assert word not in said, word
+    if command == "estimate":
+        assert "(default: contact)" in said and "(default: 100)" in said
 
 
 def npz(path: Path, **arrays) -> None:

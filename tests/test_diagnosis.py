@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import roma
 import torch
+from studies.reproduction.cases import S, study1
 
 from tests.robots import T, steel_rod
-from tests.study import study1
 from torchrod import (
     GaussianCoordinates,
     Markers,
@@ -36,7 +36,7 @@ def model_of(robot: Robot, count: int = 1) -> Model:
 def noisy(count: int, seed: int = 3) -> Markers:
     study = study1(count, seed)
     generator = torch.Generator().manual_seed(seed)
-    return Markers(study.s, study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator))
+    return Markers(S, study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator))
 
 
 def off(positions: torch.Tensor) -> torch.Tensor:

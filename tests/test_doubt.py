@@ -61,7 +61,7 @@ def errors(fit, size, at) -> tuple[float, float]:
 
 @pytest.mark.many_fits
 def test_outliers_are_named_and_cost_little():
-    """The issue's bar: with 10 % of the markers off by 50 mm, errors within 1.5 of clean."""
+    """With 10 % of the markers off by 50 mm, errors within 1.5 of clean."""
     p, size, at = drawn()
     dirty, bad = with_outliers(p)
     clean = estimate(one_contact(), Markers(S, p), 1e-3)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from reproduction import errata, sensitivity, sinusoids, tip_sensitivity
-from reproduction.cases import L, steel_rod
+from studies.reproduction import errata, sensitivity, sinusoids, tip_sensitivity
+from studies.reproduction.cases import L, steel_rod
 
 from tests.robots import T
 from torchrod import PointForces, solve_shape

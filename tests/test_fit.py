@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from torchrod.model.measurement import TIP_EXACT
 
 from tests.robots import T, busy_robot, steel_rod
 from tests.test_fast import TENSION, needs_compiler, stiffened
@@ -30,7 +31,6 @@ from torchrod.estimation import filter as ekf
 from torchrod.estimation.evaluator import Prepared
 from torchrod.mechanics.lie import move
 from torchrod.mechanics.tendons import Tendon, Tendons
-from torchrod.model.measurement import TIP_EXACT
 
 pytestmark = needs_compiler
 B = 5

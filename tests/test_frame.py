@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
+from studies.reproduction.cases import S, study1
 
 from tests.robots import T
-from tests.study import study1
 from torchrod import GaussianCoordinates, Markers, Model, Shapes, common_frame, estimate, write_shapes
 from torchrod.cli import main
 
@@ -22,7 +22,7 @@ def shapes(count: int):
     """Study 1 with 1 mm noise: as it is, and from a base frame that is off by 5 mm and 3 degrees."""
     study, generator = study1(count), torch.Generator().manual_seed(2)
     seen = study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator)
-    return study, Markers(study.s, seen), Markers(study.s, seen @ roma.rotvec_to_rotmat(TURN).T + SHIFT)
+    return study, Markers(S, seen), Markers(S, seen @ roma.rotvec_to_rotmat(TURN).T + SHIFT)
 
 
 def model_of(study, registration: bool) -> Model:
@@ -86,7 +86,7 @@ def test_the_command_line(tmp_path, capsys):
     positions = moved.positions.clone()
     positions[5] = positions[5].flip(0)
     (tmp_path / "robot.toml").write_text(ROD)
-    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(study.s, positions), [str(b) for b in range(12)]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(S, positions), [str(b) for b in range(12)]))
     files = [str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv")]
     for count in ("1", "auto"):
         out = str(tmp_path / "result.json")
@@ -113,8 +113,8 @@ def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
     plate = 0.2 * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
     noise = 1e-3 * torch.randn(40, 4, 3, generator=torch.Generator().manual_seed(3))
     seen = plate @ roma.rotvec_to_rotmat(TURN).T + SHIFT + noise
-    offsets = torch.cat([plate, plate.new_zeros(len(study.s), 3)])
-    both = Markers(torch.cat([plate.new_zeros(4), study.s]), torch.cat([seen, moved.positions], 1), offsets)
+    offsets = torch.cat([plate, plate.new_zeros(len(S), 3)])
+    both = Markers(torch.cat([plate.new_zeros(4), S]), torch.cat([seen, moved.positions], 1), offsets)
     apart = model_of(study, True)
     fits = [estimate(model_of(study, False), perfect, 1e-3), estimate(apart, both, 1e-3), estimate(apart, moved, 1e-3)]
     for what, truth in (("location", study.location), ("magnitude", study.force.norm(dim=-1))):

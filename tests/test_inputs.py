@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 import torch
+from studies.reproduction.cases import S, study1
 
 from tests.robots import busy_robot, steel_rod
-from tests.study import study1
 from torchrod import (
     Estimator,
     FourierLoads,
@@ -43,7 +43,7 @@ from torchrod.mechanics.grid import make_grid
 def seen():
     torch.set_default_dtype(torch.float64)
     study = study1(4)
-    return study.s, study.positions
+    return S, study.positions
 
 
 def one_contact(robot: Robot | None = None) -> Model:

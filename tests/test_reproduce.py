@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from reproduction import paper_mode, study2, tables
+from studies.reproduction import paper_mode, study2, tables
 
 from tests.robots import steel_rod
 from torchrod import PaperCoordinates, paper_settings
@@ -67,6 +67,7 @@ def test_the_printed_rows_are_those_of_the_shared_facts():
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_quick_reproduction(tmp_path):
     command = [
         sys.executable,

@@ -3,9 +3,9 @@
 import json
 import math
 
-import contacts
 import pytest
 import torch
+from studies import contacts
 
 from tests.robots import T, steel_rod
 from torchrod import GaussianCoordinates, GaussianLoads, Markers, Model, PointForces, PointWrenches, estimate, solve_shape
@@ -110,6 +110,7 @@ def test_a_wide_load_is_told_from_a_contact(tmp_path):
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_a_contact_and_a_push_at_the_tip_are_told_from_two_contacts_and_a_push(tmp_path):
     """Pushes along the rod beyond its buckling load: the stages alone end at "2 + tip force" in these (docs/contacts.md)."""
     truth = contacts.Truth(1, tip=True)

@@ -1,6 +1,7 @@
 """Training: its cases are what they say, and a small run goes through, resumes and repeats itself."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from torchrod import WarmStart
 from torchrod.learned.features import ACTIVE_SIZE, PASSIVE_SIZE
 from torchrod.mechanics.tendons import NEWTON_STEPS
 from training.cases import LEAST_SEEN, Recipe, block, generator_of, random_robot
+from training.data import make_block
 from training.train import main
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,6 +66,30 @@ def test_the_tendons_stay_soft():
         assert robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension) == NEWTON_STEPS
 
 
+def test_random_numbers_are_used_once():
+    """Radii and angles of six tendons are independent: over 200 robots no two of these twelve numbers correlate."""
+    recipe, rows = replace(SMALL, tendons=(6, 6)), []
+    for index in range(200):
+        routing = [t.routing[0] for t in random_robot(recipe, generator_of(recipe, index))[0].tendons.tendons]
+        rows.append([v for _, x, y in routing for v in (math.log(math.hypot(x, y)), math.atan2(y, x) % (2 * math.pi))])
+    assert torch.corrcoef(torch.tensor(rows).T).fill_diagonal_(0).abs().max() < 0.35
+
+
+def test_a_block_does_not_depend_on_the_default_precision_or_threads(tmp_path):
+    """It is written as it is made by itself, and leaves torch's own settings as they were."""
+    recipe, threads = replace(SMALL, tendons=(0, 3), weight=1.0, block_size=16), torch.get_num_threads()
+    expected = block(recipe, 1)
+    torch.set_default_dtype(torch.float32)
+    torch.set_num_threads(2)
+    try:
+        make_block(recipe, tmp_path, 1)
+        assert (torch.get_num_threads(), torch.get_default_dtype()) == (2, torch.float32)
+    finally:
+        torch.set_num_threads(threads)
+    written = load_file(tmp_path / "0001.safetensors")
+    assert all(torch.equal(written[name], value) for name, value in expected.items())
+
+
 def train(folder: Path, name: str, *options: str) -> Path:
     """Two epochs on four small blocks."""
     recipe = {f"--data.recipe.{key}": value for key, value in (("blocks", 4), ("block_size", 96), ("force", [0.1, 2.0]))}
@@ -81,6 +107,7 @@ def train(folder: Path, name: str, *options: str) -> Path:
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_a_small_run_repeats_itself_and_resumes(tmp_path):
     threads = torch.get_num_threads()
     try:

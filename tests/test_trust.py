@@ -2,11 +2,11 @@
 
 import pytest
 from matplotlib.figure import Figure
-from trusting import coverage, frame, markers, mistakes, unknown_noise
+from studies.trust import coverage, frame, markers, mistakes, unknown_noise
 
 from torchrod import Estimate
 
-pytestmark = pytest.mark.many_fits
+pytestmark = [pytest.mark.many_fits, pytest.mark.study]
 
 
 def test_coverage_of_a_contact():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-pytestmark = pytest.mark.many_fits  # of fits, or of as many forward solves
+pytestmark = [pytest.mark.many_fits, pytest.mark.study]  # of fits, or of as many forward solves
 PARTS = ("sorosim", "tendons", "elastica", "beam", "shapes")
 
 

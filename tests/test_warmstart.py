@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from studies.reproduction.cases import S, study1
 
 from tests.robots import T, csv_of, steel_rod, toml_of
-from tests.study import study1
 from tests.test_fast import needs_compiler
 from torchrod import (
     GaussianCoordinates,
@@ -54,7 +54,7 @@ def model_of(robot: Robot | None = None, count: int = 1, prior: str = "contact")
 def noisy(count: int, seed: int = 3) -> tuple[Markers, torch.Tensor]:
     study = study1(count, seed)
     draw = torch.randn(study.positions.shape, generator=torch.Generator().manual_seed(seed))
-    return Markers(study.s, study.positions + NOISE * draw), study.force
+    return Markers(S, study.positions + NOISE * draw), study.force
 
 
 def turned(markers: Markers, angle: float) -> Markers:

@@ -32,6 +32,7 @@ from torchrod.estimation.solve import CHUNK
 from torchrod.estimation.starts import in_equilibrium
 from torchrod.learned.features import features, prior_log_c
 from torchrod.learned.network import PER_LOAD, turn_of_gamma
+from torchrod.util.precision import DTYPE
 
 L, DIAMETER, E, G = 0.4, 0.0014, 207e9, 79e9  # of the rod; the features are dimensionless, so one rod stands for all
 LEAST_SEEN = 8
@@ -83,6 +84,11 @@ def generator_of(recipe: Recipe, index: int) -> torch.Generator:
     return torch.Generator().manual_seed(recipe.seed * 1_000_003 + index)
 
 
+def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    """Random numbers from 0 to 1."""
+    return torch.rand(*shape, generator=generator, dtype=DTYPE)
+
+
 def noise_of(recipe: Recipe, index: int) -> float:
     """Log-uniform over the blocks, by the golden ratio's low-discrepancy sequence (over L)."""
     low, high = recipe.noise
@@ -92,27 +98,30 @@ def noise_of(recipe: Recipe, index: int) -> float:
 def layout(recipe: Recipe, index: int, generator: torch.Generator) -> Float[Tensor, " P"]:
     """Arc lengths of the markers over L: even up to the tip, in every other block uneven and not quite up to it."""
     count = recipe.markers[index % len(recipe.markers)]
-    s = (torch.arange(count) + 1.0) / count
+    s = torch.arange(1, count + 1, dtype=DTYPE) / count
     if (index // len(recipe.markers)) % 2:
-        s = (s - 0.9 / count * torch.rand(count, generator=generator)) * (0.9 + 0.1 * torch.rand(1, generator=generator))
+        s = (s - 0.9 / count * uniform(generator, count)) * (0.9 + 0.1 * uniform(generator, 1))
     return s
 
 
 def random_robot(recipe: Recipe, generator: torch.Generator) -> tuple[Robot, float]:
     """A robot and its largest tension (N), so small that sum tau r^2 stays below TENDON_SHARE of the rod's torsional stiffness."""
     plain = Rod.circular(L, DIAMETER, E, G)
-    u = torch.rand(16, generator=generator).tolist()
+    u = uniform(generator, 16).tolist()
     count = recipe.tendons[0] + int(u[0] * (recipe.tendons[1] - recipe.tendons[0] + 1))
+    # Radius, angle and end of each tendon. Those beyond the third are drawn afterwards: robots of up to three, which the shipped
+    # checkpoints have learned from, stay what they were.
+    drawn = [*zip(u[1:4], u[4:7], u[7:10], strict=True), *uniform(generator, max(count - 3, 0), 3).tolist()]
     tendons, top = [], 6 * plain.force_scale
-    for k in range(count):
-        r, angle, end = L * 0.01 * 6 ** u[1 + k], 2 * math.pi * u[4 + k], L * min(0.4 + 0.9 * u[7 + k], 1.0)
+    for size, way, place in drawn[:count]:
+        r, angle, end = L * 0.01 * 6**size, 2 * math.pi * way, L * min(0.4 + 0.9 * place, 1.0)
         tendons.append(Tendon.straight(r * math.cos(angle), r * math.sin(angle), end))
         top = min(top, 0.7 * plain.bending_stiffness / (L * r))
     if tendons:
         reach = max(x * x + y * y for t in tendons for _, x, y in t.routing)
         softness = 1 / float(plain.K_se.diagonal().min()) + reach / float(plain.K_bt.diagonal().min())
         top = min(top, TENDON_SHARE / (count * softness))
-    direction = torch.randn(3, generator=generator)
+    direction = torch.randn(3, generator=generator, dtype=DTYPE)
     weight = recipe.weight * u[10] * plain.force_scale / L * direction / direction.norm()
     return Robot(Rod.circular(L, DIAMETER, E, G, 1.0), Tendons(tuple(tendons)), weight, "training"), top
 
@@ -152,14 +161,14 @@ def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
     generator = generator_of(recipe, index)
     robot, _ = random_robot(recipe, generator)
     B, s = recipe.block_size, L * layout(recipe, index, generator)
-    knots = 2 * torch.rand(B, 2, 4, generator=generator) - 1
-    powers = torch.linspace(0, 1, 4).unsqueeze(-1) ** torch.arange(4)
+    knots = 2 * uniform(generator, B, 2, 4) - 1
+    powers = torch.linspace(0, 1, 4, dtype=DTYPE).unsqueeze(-1) ** torch.arange(4)
     low, high = recipe.force
-    size = low * (high / low) ** torch.rand(B, 1, 1, generator=generator) * robot.rod.force_scale / L
+    size = low * (high / low) ** uniform(generator, B, 1, 1) * robot.rod.force_scale / L
     load = PolynomialLoads(size * torch.linalg.solve(powers, knots.unsqueeze(-1)).squeeze(-1), L)
     shape = solve_shape(robot, (load,), None, s, B)
     gamma = model_of(recipe, robot, prior).coordinates.start().expand(B, -1)
-    noisy = shape.p + L * noise_of(recipe, index) * torch.randn(shape.p.shape, generator=generator)
+    noisy = shape.p + L * noise_of(recipe, index) * torch.randn(shape.p.shape, generator=generator, dtype=DTYPE)
     return Draw(robot, Markers(s, noisy), gamma)
 
 
@@ -171,8 +180,8 @@ def model_of(recipe: Recipe, robot: Robot, prior: str) -> Model:
 def with_gaps(markers: Markers, generator: torch.Generator) -> Markers:
     """Up to half of the markers missing, but LEAST_SEEN there."""
     B, P = markers.positions.shape[:2]
-    gone = (torch.rand(B, 1, generator=generator) * (P - max(LEAST_SEEN, P // 2) + 1)).floor()
-    rank = torch.rand(B, P, generator=generator).argsort(-1).argsort(-1)
+    gone = (uniform(generator, B, 1) * (P - max(LEAST_SEEN, P // 2) + 1)).floor()
+    rank = uniform(generator, B, P).argsort(-1).argsort(-1)
     positions = torch.where((rank < gone).unsqueeze(-1), torch.nan, markers.positions)
     return Markers(markers.s, positions, markers.offsets, markers.tension)
 

@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 from tqdm import tqdm
 
 import torchrod
+from torchrod.util.threads import one_thread
 
 from .cases import COLUMNS, Recipe, block
 
@@ -28,14 +29,13 @@ def make_block(recipe: Recipe, folder: Path, index: int) -> None:
     """Write one block, under another name until it is whole; on one thread, so that no sum depends on how it was divided."""
     path = folder / f"{index:04d}.safetensors"
     part = path.with_suffix(f".{os.getpid()}")
-    before = torch.get_num_threads(), torch.get_default_dtype()
-    torch.set_num_threads(1)
-    torch.set_default_dtype(torch.float64)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)  # the smoothing of a learned start's features follows it, by 1e-8
     try:
-        save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
+        with one_thread(kernel=True):
+            save_file({name: value.contiguous() for name, value in block(recipe, index).items()}, part)
     finally:
-        torch.set_num_threads(before[0])
-        torch.set_default_dtype(before[1])
+        torch.set_default_dtype(before)
     part.replace(path)
 
 

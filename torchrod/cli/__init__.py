@@ -1,4 +1,4 @@
-"""The command line: arguments in `parser`, a module for each command. `torchrod --help` imports neither torch nor lightning."""
+"""The command line: arguments in `parser`, a module for each command. `torchrod --help` does not import torch."""
 
 from .parser import main
 

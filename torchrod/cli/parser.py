@@ -1,26 +1,43 @@
 """The command line. Nothing heavy is imported until a command runs, so that --help answers at once."""
 
 import importlib
-import importlib.metadata
 import sys
 import warnings
-from typing import NoReturn
+from argparse import SUPPRESS, Action
+from typing import Any, NoReturn
 
-from jsonargparse import ArgumentParser, Namespace
+from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace
+
+import torchrod
 
 from ..util.errors import InputError
 
 
+class _HelpFormatter(DefaultHelpFormatter):
+    """The help text and, where there is one, the default; no Python types, which say nothing that the text does not."""
+
+    def _get_help_string(self, action: Action) -> str:
+        text = action.help or ""
+        if text and (not action.option_strings or action.default in (None, False, SUPPRESS)):
+            return text
+        return f"{text} (default: %(default)s)" if text else super()._get_help_string(action)
+
+
 class _Parser(ArgumentParser):
     """Bad arguments are bad input: one line, exit status 2."""
+
+    def __init__(self, *arguments: Any, **options: Any):
+        super().__init__(*arguments, formatter_class=_HelpFormatter, **options)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         hint = "see torchrod --help; files come before options that take several values"
         raise InputError(f"{' '.join(str(message).split())} ({hint})") from ex
 
 
-def _number_list(parser: ArgumentParser, name: str, help: str, count: int | str = "+") -> None:
-    parser.add_argument(name, type=float, nargs=count, help=help)
+def _number_list(
+    parser: ArgumentParser, name: str, help: str, count: int | str = "+", metavar: str | tuple[str, ...] | None = None
+) -> None:
+    parser.add_argument(name, type=float, nargs=count, metavar=metavar, help=help)
 
 
 def _estimate_parser() -> ArgumentParser:
@@ -43,9 +60,8 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
     parser.add_argument("--registration", action="store_true", help="also estimate a rigid error of the base frame")
     parser.add_argument("--one-frame", action="store_true", help="with --registration: it is the same in all samples")
-    _number_list(
-        parser, "--frame-std", "with --registration: SHIFT TURN (m, rad), std of the error; 5 %% of the length, 10 degrees", 2
-    )
+    frame_std = "with --registration: std of the error (m, rad); by default 0.05 of the length and 10 degrees"
+    _number_list(parser, "--frame-std", frame_std, 2, ("SHIFT", "TURN"))
     parser.add_argument(
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
     )
@@ -82,8 +98,12 @@ def _observability_parser() -> ArgumentParser:
     _number_list(parser, "--tension", "tensions T1 T2 ... (N), one per tendon")
     parser.add_argument("--registration", action="store_true", help="the base frame is not known either")
     parser.add_argument("--place", type=int, default=None, help="propose places for so many markers, instead of --markers")
-    parser.add_argument("--from", type=float, default=None, help="with --place: the push nearest the base (m); 10 %% of the length")
-    parser.add_argument("--gap", type=float, default=None, help="with --place: least distance of markers (m); 2 %% of the length")
+    parser.add_argument(
+        "--from", type=float, default=None, help="with --place: the push nearest the base (m); by default 0.1 of the length"
+    )
+    parser.add_argument(
+        "--gap", type=float, default=None, help="with --place: least distance of markers (m); by default 0.02 of the length"
+    )
     parser.add_argument("--out", type=str, default=None, help="FIGURE.png")
     parser.add_argument("--csv", type=str, default=None, help="TABLE.csv")
     parser.add_argument("--json", type=str, default=None, help="RESULT.json")
@@ -100,8 +120,8 @@ def _simulate_parser() -> ArgumentParser:
         metavar=("S", "FX", "FY"),
         help="a point force at S (m) of FX FY (N, section frame); repeatable",
     )
-    _number_list(parser, "--tip-force", "X Y Z (N, base frame)", 3)
-    _number_list(parser, "--tip-moment", "X Y Z (N m, base frame)", 3)
+    _number_list(parser, "--tip-force", "a force at the tip (N, base frame)", 3, ("X", "Y", "Z"))
+    _number_list(parser, "--tip-moment", "a moment at the tip (N m, base frame)", 3, ("X", "Y", "Z"))
     _number_list(parser, "--tension", "tensions T1 T2 ... (N)")
     _number_list(parser, "--displacement", "instead: how far each tendon is pulled out D1 D2 ... (m); a slack one carries nothing")
     parser.add_argument("--markers", type=int, default=None, help="number of markers, evenly spaced, the last at the tip (20)")
@@ -155,17 +175,9 @@ COMMANDS = {
 HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
 
 
-def _version() -> str:
-    """Of what is installed; a copy beside it that is not says so."""
-    try:
-        return importlib.metadata.version("torchrod")
-    except importlib.metadata.PackageNotFoundError:
-        return "(not installed)"
-
-
 def _parser() -> ArgumentParser:
     about = "Forces from shape: the loads on a continuum robot from its measured markers."
-    parser = _Parser(prog="torchrod", description=about, version=_version())
+    parser = _Parser(prog="torchrod", description=about, version=torchrod.__version__)
     commands = parser.add_subcommands(required=True)
     for name, (make, help) in COMMANDS.items():
         commands.add_subcommand(name, make(), help=help)

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from peers import Fit, Problem
 
+from studies.peers import Fit, Problem
 from torchrod import Estimate, Estimator, Markers, Settings, cold_start, estimate, find_warm_start, kernel
 from torchrod.estimation import filter as ekf
 from torchrod.estimation.evaluator import Prepared

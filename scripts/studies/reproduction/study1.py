@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
+from torchrod.estimator import PAPER_GAIN
 from tqdm import tqdm
 
 from torchrod import Estimate, Status, estimate, paper_settings
-from torchrod.estimator import PAPER_GAIN
 
 from .cases import Study, study1
 from .paper_mode import STRICT, paper_lines, paper_model

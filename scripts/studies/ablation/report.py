@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from .measure import FURTHER, REPEATS, RESAMPLES, STARTS, TIMED_BATCH, WORSE
 
 TIME_TELLS = 1.1  # smaller ratios of time are noise
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 COLOURS = {"cold": "#1b2a41", "warm": "#c8102e", "oracle": "#0a7f8c"}
 MARKS = {"cold": "o", "warm": "D", "oracle": "s"}
 LABELS = {"cold": "cold: no load", "warm": "warm: the network's guess", "oracle": "oracle: the true load"}

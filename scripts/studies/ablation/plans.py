@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from reproduction.cases import L, S, steel_rod
-from reproduction.cases import study1 as draw_study1
-from reproduction.study2 import Study2
-from reproduction.study2 import study2 as draw_study2
-from reproduction.twins import MARKERS, one_tendon, two_tendons
 from torch import Tensor
 
+from studies.reproduction.cases import L, S, steel_rod
+from studies.reproduction.cases import study1 as draw_study1
+from studies.reproduction.study2 import Study2
+from studies.reproduction.study2 import study2 as draw_study2
+from studies.reproduction.twins import MARKERS, one_tendon, two_tendons
 from torchrod import GaussianCoordinates, Markers, Model, Robot, Rod, Tendon, Tendons, cold_start, estimate
 
 from .cases import MM, SEED, Case, Draw, Part, between, contact_part, drawn, log_between, with_noise
 
 TOLD_CLEAN = 1e-4  # m: the noise the estimator is told where none was added
-REFERENCE = Path(__file__).resolve().parents[2] / "tests" / "data" / "shape_reference.json"
+REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "data" / "shape_reference.json"
 
 
 def study1_part(noise: float, count: int) -> Part:

@@ -190,7 +190,7 @@ def _tables(d: dict[str, Any]) -> list[str]:
         "Tables I and II: the means in the text",
         "The text says 2.7 cm for Table I, 0.51 N and 2.64 cm for Table II. The means of |estimated - measured| over "
         "the printed "
-        "rows (`scripts/reproduction/tables.csv`) are other ones; those of Table III agree.",
+        "rows (`scripts/studies/reproduction/tables.csv`) are other ones; those of Table III agree.",
         _table(["table", "mean errors in the text", "mean of the printed rows"], rows),
     ]
 

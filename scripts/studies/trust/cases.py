@@ -9,10 +9,10 @@ from typing import TypeVar
 
 import roma
 import torch
-from reproduction.cases import L, steel_rod
 from torch import Tensor
 from tqdm import tqdm
 
+from studies.reproduction.cases import L, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, PointForces, solve_shape
 
 T = TypeVar("T")

@@ -191,7 +191,7 @@ def _lines(n: Tensor, w: dict[str, Tensor], d: dict[str, float]) -> list[str]:
         f"{d['shear_off']:.0e}). Slopes in log-log: supported {d['supported_slope']:.3f}; cantilever {d['clamped_slope']:.2f} over",
         f"n = 2..10 ({d['clamped_slope_from_n_1']:.2f} from n = 1, where the two terms of the closed form are still of one size).",
         "A cantilever filters far less: its clamp carries the load's moment, which falls like 1/n",
-        "(scripts/reproduction/sinusoids.py derives it), so (5) does not hold for a robot clamped at its base.",
+        "(scripts/studies/reproduction/sinusoids.py derives it), so (5) does not hold for a robot clamped at its base.",
         "",
     ]
 

@@ -22,7 +22,7 @@ from .processes import TORCHROD, Process
 
 FLOP = 0.37e6  # of one iteration of the base case: as the task of this benchmark states it, not counted here
 MATRIX = 1024
-EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "example"
+EXAMPLE = Path(__file__).resolve().parents[3] / "docs" / "example"
 Progress = Callable[[str], None]
 
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from reproduction.study2 import Study2
 from torch import Tensor
 
+from studies.reproduction.study2 import Study2
 from torchrod import GaussianCoordinates, Markers, Model, PointForces, Robot, solve_shape
 from torchrod.estimation.starts import in_equilibrium
 

@@ -1,4 +1,4 @@
-"""A process that measures one path or peer: python scripts/benchmarks/worker.py NAME.
+"""A process that measures one path or peer: python scripts/studies/benchmark/worker.py NAME.
 
 Reads a job a line (JSON) from standard input and answers with a line (JSON). One process per path keeps compilers, thread pools
 and memory apart; the parent asks them in turn, so that all are measured on the same machine in the same minutes.
@@ -28,11 +28,11 @@ class Worker:
     def case(self, path: str) -> tuple[Any, dict[str, np.ndarray]]:
         """The peer of a problem, and its samples."""
         if path not in self.loaded:
-            from peers import Problem, peer
+            from studies.peers import Problem, peer
 
             problem, arrays = Problem.load(Path(path))
             if self.name.startswith("torchrod"):
-                from benchmarks.torchrod_path import TorchrodPeer
+                from studies.benchmark.torchrod_path import TorchrodPeer
 
                 self.loaded[path] = TorchrodPeer(problem), arrays
             else:
@@ -41,10 +41,10 @@ class Worker:
 
     def ready(self) -> dict[str, Any]:
         """Import what the path needs."""
-        from peers import PEERS
+        from studies.peers import PEERS
 
         begin = time.perf_counter()
-        __import__(PEERS[self.name][0] if self.name in PEERS else "benchmarks.torchrod_path")
+        __import__(PEERS[self.name][0] if self.name in PEERS else "studies.benchmark.torchrod_path")
         return {"import_s": time.perf_counter() - begin}
 
     def dgemm(self) -> dict[str, Any]:
@@ -101,7 +101,7 @@ class Worker:
             found = timed(lambda: peer.estimate(x, positions), budget)
             fit = found.pop("value")
             return found | {"converged": float(fit.converged.mean()), "iterations": float(fit.iterations.mean())}
-        from benchmarks.torchrod_path import kernel_seconds
+        from studies.benchmark.torchrod_path import kernel_seconds
 
         found = timed(lambda: peer.fitted(start, positions), budget, kernel_seconds)
         fit = found.pop("value")
@@ -189,7 +189,7 @@ def timed(
 
 def main() -> None:
     """Serve jobs until standard input ends."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
     worker = Worker(sys.argv[1])
     answers, sys.stdout = sys.stdout, sys.stderr  # what a library prints must not be taken for an answer
     for line in sys.stdin:

@@ -17,10 +17,10 @@ from typing import Any, Protocol
 import numpy as np
 
 PEERS = {
-    "numba": ("peers.numba_peer", "NumbaPeer", "numba"),
-    "jax": ("peers.jax_peer", "JaxPeer", "jax"),
-    "jax, tuned": ("peers.jax_peer", "TunedJaxPeer", "jax"),
-    "scipy": ("peers.scipy_peer", "ScipyPeer", "scipy"),
+    "numba": ("studies.peers.numba_peer", "NumbaPeer", "numba"),
+    "jax": ("studies.peers.jax_peer", "JaxPeer", "jax"),
+    "jax, tuned": ("studies.peers.jax_peer", "TunedJaxPeer", "jax"),
+    "scipy": ("studies.peers.scipy_peer", "ScipyPeer", "scipy"),
 }
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6  # converged: a step promises to lower the cost by less than this, or this share of it
 SETTLED = 1.0  # the problem with adapted weights is at its minimum when a step promises less than this

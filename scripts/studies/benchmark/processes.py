@@ -9,9 +9,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import peers
+from studies import peers
 
-SCRIPTS = Path(__file__).resolve().parents[1]
+STUDIES = Path(__file__).resolve().parents[1]
 ONLY = "import os, sys; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:{cores}]); os.execv(sys.argv[1], sys.argv[1:])"
 PATIENCE = 900  # seconds that a worker may take for a job
 TORCHROD = {
@@ -27,7 +27,7 @@ def available(name: str) -> bool:
 
 def environment(name: str, caches: Path) -> dict[str, str]:
     """What a worker is started with. numba forgets to look whether functions that a cached one calls have changed."""
-    sources = b"".join(path.read_bytes() for path in sorted((SCRIPTS / "peers").glob("*.py")))
+    sources = b"".join(path.read_bytes() for path in sorted((STUDIES / "peers").glob("*.py")))
     numba = caches / f"numba-{hashlib.sha256(sources).hexdigest()[:12]}"
     return os.environ | {"NUMBA_CACHE_DIR": str(numba)} | TORCHROD.get(name, {})
 
@@ -37,7 +37,7 @@ class Process:
 
     def __init__(self, name: str, caches: Path, cores: int | None = None, more: dict[str, str] | None = None):
         self.name = name
-        command = [sys.executable, str(SCRIPTS / "benchmarks" / "worker.py"), name]
+        command = [sys.executable, str(STUDIES / "benchmark" / "worker.py"), name]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         own = environment(name, caches) | (more or {})
         if cores is not None:

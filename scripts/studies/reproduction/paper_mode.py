@@ -90,7 +90,7 @@ def search_lines(rows: list[dict[str, str]]) -> list[str]:
     lines = [
         "The paper tuned Q and W by hand and prints neither. `python scripts/paper_search.py` looks for them (and for Sigma_0, the",
         "start's width, the range of (11) and the tip's W) on other cases than the 100 above and writes every choice it tried to",
-        f"`scripts/reproduction/paper_search.csv`. Of {len(drawn)} random choices {_count(drawn)} reach 94 % converged and",
+        f"`scripts/studies/reproduction/paper_search.csv`. Of {len(drawn)} random choices {_count(drawn)} reach 94 % converged and",
         "accepted in",
         f"both rows, of {len(stage['near'])} near the best of them {_count(stage['near'])}, and {_count(drawn, '_strict')} and",
         f"{_count(stage['near'], '_strict')} by the strict criterion. Square roots of Q's diagonal and the rest, to one digit, on",

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from reproduction.cases import L
-from reproduction.study2 import force_error
 from torch import Tensor
 
+from studies.reproduction.cases import L
+from studies.reproduction.study2 import force_error
 from torchrod import Estimate, Markers, Model, Settings, Start, Status, WarmStart, cold_start, estimate, find_warm_start
 from torchrod.estimation import filter as ekf
 from torchrod.estimation.at_rest import at_rest

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NAVY, RED, TEAL, GREY = "#1b2a41", "#c8102e", "#0a7f8c", "#9a9a9a"
 FINE = 160  # steps: RK4 then errs 4^4 times less than with the default 40, so the difference is our own step error
 UNITS = {"m": (1e3, "mm"), "N": (1.0, "N"), "N m": (1.0, "N m"), "relative": (1.0, "relative")}

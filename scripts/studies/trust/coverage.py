@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import torch
 from matplotlib.axes import Axes
-from reproduction.cases import L, S
 from torch import Tensor
 
+from studies.reproduction.cases import L, S
 from torchrod import Estimate, Model, Status, estimate, forward_jacobian, load_profile, solve_shape
 
 from .cases import NOISE, ROBOT, generator, in_parallel, model, noisy, pushes

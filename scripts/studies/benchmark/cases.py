@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from peers import Problem
-from reproduction.cases import steel_rod
+from torchrod.model.measurement import TURN_SCALE
 
+from studies.peers import Problem
+from studies.reproduction.cases import steel_rod
 from torchrod import GaussianCoordinates, Model, PointForces, solve_shape
 from torchrod.mechanics.statics import grid_for
-from torchrod.model.measurement import TURN_SCALE
 
 DISTINCT = 256  # different samples; larger batches repeat them
 OFF = 0.1  # how far from the truth, in units of x, an iteration is timed

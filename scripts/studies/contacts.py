@@ -1,0 +1,183 @@
+"""How often --contacts auto finds the right loads: python scripts/contacts.py [--samples N] [--out DIR] writes DIR/contacts.md.
+
+The paper's steel rod, pushes of 0.5 to 2 N at 10 to 39 cm, two of them at least 8 cm apart, 1 mm noise unless said otherwise: how
+many contacts; a contact or something at the tip (--unknown-tip); a contact or a distributed load (--load-prior auto).
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from studies.reproduction.cases import L, steel_rod
+from torchrod import (
+    GaussianCoordinates,
+    Markers,
+    Model,
+    PointForces,
+    PointWrenches,
+    Settings,
+    cold_start,
+    find_warm_start,
+    solve_shape,
+)
+from torchrod.analysis.count import Hypothesis, select
+from torchrod.mechanics.loads import Load
+
+ROBOT = steel_rod()
+NOISE, GAP, MOST = 1e-3, 0.08, 3
+LEAST = {20: (97, 97, 95), 8: (97, 97, 92)}  # percent right that we ask for, for 0, 1, 2 contacts
+
+
+@dataclass(frozen=True)
+class Truth:
+    """So many contacts, point forces or, of a named width, distributed; and perhaps a dead force of the same size at the tip."""
+
+    contacts: int
+    width: str = "point"
+    tip: bool = False
+
+
+def _uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+
+def _loads(truth: Truth, samples: int, generator: torch.Generator) -> tuple[Load, ...]:
+    place = (0.1 + 0.29 * _uniform(generator, 20 * samples, truth.contacts)).sort(-1).values
+    place = place[(place.diff(dim=-1) >= GAP).all(-1)][:samples]
+    size = 0.5 + 1.5 * _uniform(generator, samples, truth.contacts)
+    angle = 2 * math.pi * _uniform(generator, samples, truth.contacts)
+    force = torch.stack([size * angle.cos(), size * angle.sin()], -1)
+    loads: tuple[Load, ...] = ()
+    if truth.contacts and truth.width == "point":
+        loads = (PointForces(torch.nn.functional.pad(force, (0, 1)), place),)
+    elif truth.contacts:
+        as_such = GaussianCoordinates(truth.contacts, L, ROBOT.rod.force_scale, truth.width)
+        width = as_such.start().unflatten(0, (truth.contacts, 4))[:, 3].expand(samples, -1)
+        gamma = torch.cat([force / ROBOT.rod.force_scale, torch.stack([torch.logit(place / L), width], -1)], -1)
+        loads = as_such.loads(gamma.flatten(1))
+    if truth.tip:
+        way = torch.randn(samples, 3, generator=generator, dtype=torch.float64)
+        push = (0.5 + 1.5 * _uniform(generator, samples, 1)) * way / way.norm(dim=-1, keepdim=True)
+        loads = (
+            *loads,
+            PointWrenches(push.unsqueeze(1), torch.zeros_like(push).unsqueeze(1), torch.tensor([L], dtype=torch.float64)),
+        )
+    return loads
+
+
+def cases(truth: Truth, markers: int, samples: int, seed: int, noise: float = NOISE) -> Markers:
+    """Noisy markers of random loads."""
+    generator = torch.Generator().manual_seed(seed)
+    s = torch.linspace(L / markers, L, markers, dtype=torch.float64)
+    p = solve_shape(ROBOT, _loads(truth, samples, generator), None, s, samples, 80).p
+    return Markers(s, p + noise * torch.randn(p.shape, generator=generator, dtype=torch.float64))
+
+
+def _hypothesis(name: str, contacts: int, prior: str = "contact", tip: str = "none") -> Hypothesis:
+    return Hypothesis(name, contacts, Model(ROBOT, GaussianCoordinates(contacts, L, ROBOT.rod.force_scale, prior), tip=tip))
+
+
+COUNTS = [_hypothesis(str(k), k) for k in range(MOST + 1)]
+TIPS = [_hypothesis(f"{k}{' + tip' * (tip != 'none')}", k, tip=tip) for k in range(MOST + 1) for tip in ("none", "force")]
+WIDTHS = [
+    _hypothesis(f"{k} {prior}" if k else "0", k, prior)
+    for k in range(MOST + 1)
+    for prior in (("contact", "distributed") if k else ("contact",))
+]
+
+
+def chosen(hypotheses: list[Hypothesis], markers: Markers, noise: float = NOISE) -> list[int]:
+    """How many samples chose each hypothesis."""
+
+    def bar(total: int, what: str) -> AbstractContextManager[tqdm]:
+        return tqdm(total=total, desc=what, delay=1.0, leave=False)
+
+    _, evidence = select(hypotheses, markers, noise, Settings(), lambda model: find_warm_start(model) or cold_start, bar)
+    return torch.bincount(evidence.choice, minlength=len(hypotheses)).tolist()
+
+
+def _row(*cells: object) -> str:
+    row = "| " + " | ".join(map(str, cells)) + " |"
+    print(row, flush=True)
+    return row
+
+
+def counts(samples: int) -> list[str]:
+    """The confusion matrices of the number of contacts."""
+    lines = ["| markers | true | chosen 0 | 1 | 2 | 3 | right | asked for |", "|" + "---|" * 8]
+    for markers, least in LEAST.items():
+        for contacts in range(3):
+            found = chosen(COUNTS, cases(Truth(contacts), markers, samples, 100 * markers + contacts))
+            lines.append(_row(markers, contacts, *found, f"{100 * found[contacts] / samples:.1f} %", f"{least[contacts]} %"))
+    return lines
+
+
+def _shares(rows: Sequence[tuple[str, str, list[int]]], names: list[str], samples: int, true: str) -> list[str]:
+    """A table of shares: what is true, its hypothesis, and how many chose each; columns that nobody chose are left out."""
+    shown = [i for i in range(len(names)) if any(found[i] for _, _, found in rows)]
+    lines = [_row(true, *(names[i] for i in shown), "right"), "|" + "---|" * (len(shown) + 2)]
+    for what, name, found in rows:
+        cells = [f"{100 * found[i] / samples:.1f} %" for i in shown]
+        lines.append(_row(what, *cells, f"{100 * found[names.index(name)] / samples:.1f} %"))
+    return lines
+
+
+def tips(samples: int) -> list[str]:
+    """A contact, or something at the tip?"""
+    rows = []
+    for i, (what, name, truth) in enumerate(
+        (
+            ("nothing", "0", Truth(0)),
+            ("a force at the tip", "0 + tip", Truth(0, tip=True)),
+            ("one contact", "1", Truth(1)),
+            ("one contact, and a force at the tip", "1 + tip", Truth(1, tip=True)),
+        )
+    ):
+        rows += [
+            (f"{what}, {1e3 * noise:g} mm", name, chosen(TIPS, cases(truth, 20, samples, 5000 + i, noise), noise))
+            for noise in (1e-3, 2e-4)
+        ]
+    return _shares(rows, [h.name for h in TIPS], samples, "true, noise")
+
+
+def widths(samples: int) -> list[str]:
+    """A contact, or a distributed load?"""
+    rows = []
+    for i, (what, name, truth) in enumerate(
+        (
+            ("one contact, sigma 10 mm", "1 contact", Truth(1, "contact")),
+            ("one distributed load, sigma 100 mm", "1 distributed", Truth(1, "distributed")),
+        )
+    ):
+        rows += [
+            (f"{what}, {1e3 * noise:g} mm", name, chosen(WIDTHS, cases(truth, 20, samples, 6000 + i, noise), noise))
+            for noise in (1e-3, 2e-4, 5e-5)
+        ]
+    return _shares(rows, [h.name for h in WIDTHS], samples, "true, noise")
+
+
+def main() -> None:
+    """Write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--samples", type=int, default=1000)
+    parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[2] / "docs")
+    options = parser.parse_args()
+    lines = ["# How many contacts", "", "Made by `python scripts/contacts.py`: `--contacts auto` with the contact prior."]
+    lines += [f"{options.samples} cases a row; pushes of 0.5 to 2 N at 100 to 390 mm of the 400 mm steel rod, two at least"]
+    lines += ["80 mm apart, 1 mm noise.", "", *counts(options.samples), ""]
+    lines += [
+        "## Something at the tip",
+        "",
+        "The same with `--unknown-tip force`: forces at the tip of 0.5 to 2 N in any direction, 20 markers.",
+    ]
+    lines += ["", *tips(options.samples), ""]
+    lines += ["## A contact or a distributed load", "", "The same with `--load-prior auto`, one load, 20 markers."]
+    lines += ["", *widths(options.samples), ""]
+    (options.out / "contacts.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
