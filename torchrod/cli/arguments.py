@@ -12,7 +12,7 @@ from ..util.files import writing
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 INPUTS = ("robot", "shapes", "result", "spec", "warm_start")  # options that name files to be read,
 OUTPUTS = ("out", "plot", "json", "csv")  # and those that name files to be written
-MOST_STEPS = 100_000
+MOST_STEPS = 100_000  # along a rod
 COARSEST = 0.25  # of the length: with more noise no shape shows
 
 
@@ -20,20 +20,6 @@ def positive(name: str, value: float) -> None:
     """Refuse what is not a positive number."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}; it must be a positive number")
-
-
-def whole(least: int, most: int):
-    """The type of an option: a whole number within limits. Errors: ValueError in one sentence."""
-
-    def checked(value: str) -> int:
-        text = str(value).strip()
-        digits = text.removeprefix("-").removeprefix("+")
-        number = int(text) if digits.isascii() and digits.isdigit() and len(digits) < 20 else None
-        if number is None or not least <= number <= most:
-            raise ValueError(f"{text[:40]!r} must be a whole number from {least} to {most}")
-        return number
-
-    return checked
 
 
 def _same_file(one: str, other: str) -> bool:
@@ -48,6 +34,8 @@ def apart(options: Namespace) -> None:
     """Refuse an output that would replace an input, or another output. Errors: InputError."""
     given = {name: options.get(name) for name in (*INPUTS, *OUTPUTS)}
     paths = [(name, value) for name, value in given.items() if isinstance(value, str) and "\0" not in value]
+    if ("warm_start", given["warm_start"]) in paths:
+        paths.insert(0, ("warm_start", str(Path(str(given["warm_start"])).with_suffix(".json"))))  # its card
     for i, (name, path) in enumerate(paths):
         for earlier, other in paths[:i] if name in OUTPUTS else ():
             if _same_file(path, other) and not _device(path):

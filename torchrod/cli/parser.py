@@ -8,10 +8,14 @@ import warnings
 from typing import NoReturn
 
 from jsonargparse import ArgumentParser, Namespace
+from jsonargparse.typing import restricted_number_type
 
 from ..util.errors import InputError
-from .arguments import MOST_STEPS, apart, whole
+from .arguments import MOST_STEPS, apart
 from .screen import held_back, one_line, tell
+
+
+Steps = restricted_number_type("from 1 to 100,000", int, [(">=", 1), ("<=", MOST_STEPS)])
 
 
 class _Parser(ArgumentParser):
@@ -60,7 +64,7 @@ def _estimate_parser() -> ArgumentParser:
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
-    parser.add_argument("--steps", type=whole(1, MOST_STEPS), default=40, help="least number of arc-length steps")
+    parser.add_argument("--steps", type=Steps, default=40, help="least number of arc-length steps")
     parser.add_argument("--max-iterations", type=int, default=100, help="give a sample up after this many")
     return parser
 

@@ -74,7 +74,7 @@ def _warn_of_gaps(path: Path, gap: Bool[Tensor, "B P"], s: Float[Tensor, " P"]) 
     places = gap.any(0).nonzero().flatten()
     named = ", ".join(f"{1e3 * v:.4g}" for v in s[places[:5]].tolist()) + (", ..." if len(places) > 5 else "")
     warnings.warn(
-        f"{path}: {int(gap.sum())} positions are exactly (0, 0, 0){where} (s = {named} mm) and are taken as missing; "
+        f"{path}: markers at exactly (0, 0, 0), {int(gap.sum())}{where} (s = {named} mm), are taken as missing; "
         "leave the cells of a missing marker empty",
         stacklevel=3,
     )
@@ -96,8 +96,8 @@ def _check_pulls(path: Path, markers: Markers, robot: Robot) -> None:
     if bool((mostly & far).any()):
         raise InputError(f"{path}: tension {float(markers.tension.min()):g} N is negative; a tendon can only pull, give at least 0")
     warnings.warn(
-        f"{path}: {int(below.sum())} readings of tension are negative, down to {float(markers.tension.min()):g} N, in "
-        f"{int(below.any(-1).sum())} of {len(pull)} samples; these tendons are taken as slack, with no tension",
+        f"{path}: negative tensions, {int(below.sum())} in {int(below.any(-1).sum())} of {len(pull)} samples, down to "
+        f"{float(markers.tension.min()):g} N, are taken as those of slack tendons, which carry nothing",
         stacklevel=3,
     )
 
