@@ -3,7 +3,6 @@
 import importlib
 import importlib.metadata
 import re
-import sys
 import warnings
 from typing import NoReturn
 
@@ -13,7 +12,6 @@ from jsonargparse.typing import restricted_number_type
 from ..util.errors import InputError
 from .arguments import MOST_STEPS, apart
 from .screen import held_back, one_line, tell
-
 
 Steps = restricted_number_type("from 1 to 100,000", int, [(">=", 1), ("<=", MOST_STEPS)])
 

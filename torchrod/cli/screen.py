@@ -60,7 +60,9 @@ def _show(screen: TextIO, text: str) -> None:
         _discard(screen)
     except OSError as error:
         _discard(screen)
-        raise InputError(f"standard output: cannot be written {reason(error, 'check where it goes', 'check where it goes')}") from None
+        raise InputError(
+            f"standard output: cannot be written {reason(error, 'check where it goes', 'check where it goes')}"
+        ) from None
 
 
 def _discard(screen: TextIO) -> None:

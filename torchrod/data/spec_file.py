@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from ..io.robot_file import read_robot
-from ..io.values import as_number, as_numbers, as_table, read_toml, shown
+from ..io.values import as_number, as_numbers, as_table, read_toml
 from ..mechanics.robot import Robot
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from .dataset import DISTRIBUTIONS, FAMILIES, DatasetSpec, Range
 
 KEYS = {

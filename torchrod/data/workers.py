@@ -7,6 +7,7 @@ leaves nothing behind but a shard to be computed again.
 import contextlib
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
@@ -53,7 +54,11 @@ def produce(
 
 
 def _leave_with_parent() -> None:
-    """End this worker process when the command is killed: the pool itself would wait for work for ever."""
+    """End this worker process when the command is killed: the pool itself would wait for work for ever.
+
+    What interrupts the command goes to its workers as well; the command alone has something to say of it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 
     def watch() -> None:

@@ -17,12 +17,11 @@ from ..analysis.noise import Noise
 from ..estimation.fit import Evidence, Fit
 from ..estimation.load_profile import Profile
 from ..estimation.result import Estimate
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.files import put, reading
 from ..util.status import Status
 from .json_file import plain
 from .npz_file import UNREADABLE, why
-from .values import shown
 
 RESULT_SUFFIXES = (".json", ".npz")
 
@@ -208,7 +207,7 @@ def write_result(
 
 @dataclass(frozen=True)
 class _Asked:
-    """Which fit of which file, and what it has to be of where that is known: the robot's name and length (m), the markers' number."""
+    """Which fit of which file, and what it has to be of where that is known: the robot's name, its length (m), how many markers."""
 
     path: Path
     sample: str

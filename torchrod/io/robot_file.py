@@ -8,11 +8,11 @@ from typing import Any
 import torch
 
 from ..mechanics.robot import Robot
-from ..mechanics.rod import Rod
+from ..mechanics.rod import Rod, check_stiffness
 from ..mechanics.tendons import Tendon, Tendons
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.precision import DTYPE
-from .values import as_number, as_numbers, as_rows, as_table, read_toml, shown
+from .values import as_number, as_numbers, as_rows, as_table, read_toml
 
 TOP_KEYS = {"name", "rod", "tendons"}
 ROD_KEYS = {
@@ -40,8 +40,10 @@ def _stiffness(where: str, value: object) -> torch.Tensor:
         K = torch.diag(torch.tensor(as_numbers(where, value, 3), dtype=DTYPE))
     else:
         raise InputError(f"{where} is {shown(value)}; it must be three numbers (the diagonal) or three rows of three numbers")
-    if not torch.allclose(K, K.mT, rtol=1e-6, atol=0) or int(torch.linalg.cholesky_ex(K).info) != 0:
-        raise InputError(f"{where} must be symmetric positive definite, in N (K_se) or N m^2 (K_bt)")
+    try:
+        check_stiffness(where, K, "N (K_se) or N m^2 (K_bt)")
+    except ValueError as error:
+        raise InputError(str(error)) from None
     return K
 
 

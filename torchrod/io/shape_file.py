@@ -19,10 +19,9 @@ from ..mechanics.grid import on_rod
 from ..mechanics.robot import Robot
 from ..model.marker_geometry import at_origin, too_far, too_short
 from ..model.measurement import Markers
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.files import put, reading
 from .npz_file import UNREADABLE, read_arrays, why
-from .values import shown
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")

@@ -6,11 +6,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.files import reading
-
-
-MOST_SHOWN = 80  # letters
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -20,15 +17,6 @@ def read_toml(path: Path) -> dict[str, Any]:
             return tomllib.loads(path.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a path that is none
             raise InputError(f"{path}: is not valid TOML ({error}); correct that place (docs/files.md has the keys)") from None
-
-
-def shown(value: object) -> str:
-    """A value as a refusal quotes it: short, whatever it is."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # Python writes no whole number of thousands of digits
-        text = "a number of too many digits"
-    return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
 
 
 def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
     zero = (at_origin(markers)[sample]).nonzero().flatten()
     if len(zero):
         places = _named(zero.tolist(), markers.s)
-        return f"{places} at exactly (0, 0, 0), which another program may write for a missing marker: leave the cells empty, or NaN."
+        return f"{places} at exactly (0, 0, 0), which some programs write for a missing one: leave the cells empty, or NaN."
     slack = OFF * length if markers.offsets is None else OFF * length + float(markers.offsets.norm(dim=-1).max())
     size, scale = float(z.abs().max()), _scale(z, s, length)
     spans, along = float(z.diff(dim=0).norm(dim=-1).sum()), float(s[-1] - s[0])
