@@ -3,7 +3,7 @@
     shard-00000.npz    the arrays of data.dataset.ARRAYS; the same arrays make the same file, byte for byte
     shard-00000.json   its checksum; written after it, so a shard without a sidecar is not finished
     manifest.json      specification, units and checksums; written by whoever finds all sidecars
-    spec.json          the specification's checksum; the first job's, and whoever has another is refused
+    spec.json          until then: the checksum of the first job's specification; whoever has another is refused
 
 Every file is written beside its place and then moved there, so that a reader sees all of it or nothing. No two jobs of a cluster
 share a file but the manifest, which is the same whoever writes it. Every refusal is one sentence with file and remedy.
@@ -179,6 +179,8 @@ def write_manifest(folder: Path, spec: DatasetSpec) -> str | None:
         "shards": [{key: r[key] for key in keys} for r in shards],
     }
     put_json(folder / MANIFEST, content)
+    with suppress(OSError):  # the manifest says whose the folder is from now on
+        (folder / CLAIM).unlink(missing_ok=True)
     return content["digest"]
 
 

@@ -177,7 +177,7 @@ def _rows(path: Path, file: IO[bytes]) -> tuple[list[tuple[int, list[str]]], boo
     """The numbered rows of cells, header first, and whether a comma is their decimal mark."""
     comments: list[str] = []
     try:
-        text = io.TextIOWrapper(file, newline="", encoding="utf-8-sig").read()
+        text = file.read().decode("utf-8-sig")
         lines = list(_without_comments(io.StringIO(text, newline=""), comments))
         first = next((line for line in lines if line.strip()), "")
         mark, header = _delimiter(first), None
