@@ -4,10 +4,15 @@ import math
 import os
 from pathlib import Path
 
+from jsonargparse import Namespace
+
 from ..util.errors import InputError
 from ..util.files import writing
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
+INPUTS = ("robot", "shapes", "result", "spec", "warm_start")  # options that name files to be read,
+OUTPUTS = ("out", "plot", "json", "csv")  # and those that name files to be written
+MOST_STEPS = 100_000  # along a rod
 COARSEST = 0.25  # of the length: with more noise no shape shows
 
 
@@ -15,6 +20,35 @@ def positive(name: str, value: float) -> None:
     """Refuse what is not a positive number."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} is {value}; it must be a positive number")
+
+
+def _same_file(one: str, other: str) -> bool:
+    """Whether two names lead to one file: through links, hard ones too, and before there is a file."""
+    try:
+        return Path(one).samefile(other)
+    except (OSError, ValueError):
+        return os.path.realpath(one) == os.path.realpath(other)
+
+
+def apart(options: Namespace) -> None:
+    """Refuse an output that would replace an input, or another output. Errors: InputError."""
+    given = {name: options.get(name) for name in (*INPUTS, *OUTPUTS)}
+    paths = [(name, value) for name, value in given.items() if isinstance(value, str) and "\0" not in value]
+    if ("warm_start", given["warm_start"]) in paths:
+        paths.insert(0, ("warm_start", str(Path(str(given["warm_start"])).with_suffix(".json"))))  # its card
+    for i, (name, path) in enumerate(paths):
+        for earlier, other in paths[:i] if name in OUTPUTS else ():
+            if _same_file(path, other) and not _device(path):
+                what = f"--{earlier} is to be written there" if earlier in OUTPUTS else "it is what is read"
+                raise InputError(f"--{name} {path}: {what}, and would be lost; give another name")
+
+
+def _device(path: str) -> bool:
+    """Something that is there and takes more than one output, as /dev/null does."""
+    try:
+        return Path(path).exists() and not Path(path).is_file() and not Path(path).is_dir()
+    except OSError:
+        return False
 
 
 def writable(path: str | None, suffixes: tuple[str, ...]) -> None:

@@ -33,17 +33,21 @@ def calibrate(options: Namespace) -> None:
         found = run_calibration(robot, markers, shapes.tension, options.youngs_modulus, options.tension_offset, settings)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
-    for name, used in zip(shapes.samples, found.used.tolist(), strict=True):
-        if not used:
-            warnings.warn(
-                f"{options.shapes}: sample {name} is left out: it has no markers, no finite tensions or no equilibrium",
-                stacklevel=2,
-            )
+    out = [name for name, used in zip(shapes.samples, found.used.tolist(), strict=True) if not used]
+    if out:
+        who = (
+            f"sample {out[0]} is left out: it has" if len(out) == 1 else f"{len(out)} samples are left out ({_few(out)}): they have"
+        )
+        warnings.warn(f"{options.shapes}: {who} no markers, no finite tensions or no equilibrium", stacklevel=2)
     print(_report(found, shapes, options))  # noqa: T201
     if options.json:
         write_calibration(options.json, found, shapes.samples, robot.name, options.noise)
     if options.out:
         _write_robot(options, robot, found)
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
 def _write_robot(options: Namespace, robot: Robot, found: Calibration) -> None:

@@ -1,16 +1,21 @@
 """The command line. Nothing heavy is imported until a command runs, so that --help answers at once."""
 
 import importlib
-import sys
+import re
 import warnings
 from argparse import SUPPRESS, Action
 from typing import Any, NoReturn
 
 from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace
+from jsonargparse.typing import restricted_number_type
 
 import torchrod
 
 from ..util.errors import InputError
+from .arguments import MOST_STEPS, apart
+from .screen import held_back, one_line, tell
+
+Steps = restricted_number_type("from 1 to 100,000", int, [(">=", 1), ("<=", MOST_STEPS)])
 
 
 class _HelpFormatter(DefaultHelpFormatter):
@@ -28,6 +33,8 @@ class _Parser(ArgumentParser):
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, formatter_class=_HelpFormatter, **options)
+        # argparse takes -1 and -0.5 for numbers, but -5e-4 for an option
+        self._negative_number_matcher = re.compile(r"-(\d[\d_]*\.?\d*|\.\d+)(e[+-]?\d+)?$|-(inf|infinity|nan)$", re.IGNORECASE)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         hint = "see torchrod --help; files come before options that take several values"
@@ -68,7 +75,7 @@ def _estimate_parser() -> ArgumentParser:
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
-    parser.add_argument("--steps", type=int, default=40, help="least number of arc-length steps")
+    parser.add_argument("--steps", type=Steps, default=40, help="least number of arc-length steps")
     parser.add_argument("--max-iterations", type=int, default=100, help="give a sample up after this many")
     return parser
 
@@ -187,24 +194,32 @@ def _parser() -> ArgumentParser:
 def _run(options: Namespace) -> None:
     name = options.subcommand
     home = importlib.import_module(f".{HOMES.get(name, name)}", __package__)
+    apart(options[name])
     getattr(home, name.replace("-", "_"))(options[name])
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command `torchrod`. Exit status 0 when it did its work, 2 with one line on stderr for bad input, 130 after Ctrl-C."""
+    """The command `torchrod`. Exit status 0 when it did its work, 2 with one line on stderr for bad input, 130 when interrupted.
 
-    def one_line(message: Warning | str, *_: object) -> None:
-        print(f"torchrod: warning: {message}", file=sys.stderr)  # noqa: T201
+    What a command prints is held back until its files are written: a screen that cannot take it loses no result.
+    """
+    said: set[str] = set()
+
+    def warned(message: Warning | str, *_: object) -> None:
+        line = one_line(f"torchrod: warning: {message}")
+        if line not in said:  # 600 samples may each find the same wrong with one file
+            said.add(line)
+            tell(line)
 
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), held_back():
             warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = one_line
+            warnings.showwarning = warned
             _run(_parser().parse_args(arguments))
     except InputError as error:
-        print(f"torchrod: {error}", file=sys.stderr)  # noqa: T201
+        tell(one_line(f"torchrod: {error}"))
         return 2
     except KeyboardInterrupt:
-        print("torchrod: interrupted", file=sys.stderr)  # noqa: T201
+        tell("torchrod: interrupted")
         return 130
     return 0

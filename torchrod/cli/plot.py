@@ -13,11 +13,11 @@ def plot(options: Namespace) -> None:
 
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot)
-    sample = options.sample or shapes.samples[0]
+    sample = shapes.samples[0] if options.sample is None else options.sample
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
     writable(options.out, FIGURE_SUFFIXES)
-    fit = read_fit(options.result, sample, robot.name, len(shapes.s))
+    fit = read_fit(options.result, sample, robot.name, len(shapes.s), robot.rod.length)
     b = shapes.samples.index(sample)
     tension = None if shapes.tension is None else shapes.tension[b]
     draw(options.out, robot, fit, shapes.positions[b], tension, f"{robot.name}, sample {sample}")

@@ -1,12 +1,16 @@
 """The table on the screen."""
 
 import math
+import sys
 
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
 from ..estimation.result import Estimate
 from ..util.status import Status
+from .screen import one_line
 
+MOST_LINES = 50  # on a terminal, where more would push the first away
+MOST_NOTES = 10
 HEADS = {"force (N)": 20, "F_x (N)": 10, "F_y (N)": 10, "location (mm)": 20}  # and the least width of a column
 GAP = 2
 MOST_DECIMALS = 7  # what needs more is written with an exponent
@@ -39,32 +43,61 @@ def _cells(result: Estimate, there: list[tuple[int, int]]) -> list[list[str]]:
 
 
 def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noise | None) -> str:
-    """The table on the screen: one line per load."""
-    force = result.force[..., 0].tolist()
+    """The table on the screen: one line per load, sentences on the fits that are not accepted, and how many are.
+
+    On a terminal no more than MOST_LINES lines and MOST_NOTES sentences, and a word on where the rest is.
+    """
+    terminal = sys.stdout is not None and sys.stdout.isatty()
+    shown = len(samples)
+    if terminal and len(samples) + int((~result.accepted).sum()) > MOST_LINES:
+        shown = min(shown, MOST_LINES - MOST_NOTES)
+    lines = _lines(result, samples[:shown], noise)
+    notes, further = [], 0
+    for b in _noted(result, diagnosis):
+        if terminal and len(notes) == MOST_NOTES and shown < len(samples):
+            further += 1
+        else:
+            notes.append(one_line(f"sample {samples[b]}: {result.message(b)} {diagnosis.message(b)}".rstrip()))
+    if shown < len(samples):
+        rest = f"{len(samples) - shown} more samples" + (f" and {further} more sentences" if further else "")
+        lines.append(f"... {rest}: with --out in RESULT, or here where the output goes to a file or a pipe")
+    return "\n".join([*lines, *notes, _summary(result)])
+
+
+def _noted(result: Estimate, diagnosis: Diagnosis) -> list[int]:
+    """The samples of which there is something to say."""
+    return [b for b, fine in enumerate(result.accepted.tolist()) if not fine or diagnosis.message(b)]
+
+
+def _summary(result: Estimate) -> str:
+    """How many samples came to what."""
+    status = result.status.tolist()
+    words = [f"{status.count(int(s))} {s.label.replace('_', ' ')}" for s in Status if s is Status.CONVERGED or int(s) in status]
+    return f"{len(status)} sample{'s' * (len(status) != 1)}: {', '.join(words)}; {int(result.accepted.sum())} accepted"
+
+
+def _lines(result: Estimate, samples: list[str], noise: Noise | None) -> list[str]:
+    """The head of the table, and the lines of the first samples."""
+    force = result.force[: len(samples), :, 0].tolist()
     there = [(b, k) for b, row in enumerate(force) for k, v in enumerate(row) if not math.isnan(v)]
     cells = _cells(result, there)
     widths = [max([least, *(GAP + len(cell) for cell in column)]) for least, column in zip(HEADS.values(), cells, strict=True)]
-    loads = {
-        which: "".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
-        for which, row in zip(there, zip(*cells, strict=True), strict=True)
-    }
+    loads: dict[int, list[str]] = {}
+    for (b, k), row in zip(there, zip(*cells, strict=True), strict=True):
+        loads.setdefault(b, []).append(f"{k + 1:>4}" + "".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True)))
     columns = "".join(f"{head:>{width}}" for head, width in zip(HEADS, widths, strict=True))
     lines = [f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{columns}{'rms (mm)':>10}"]
-    notes = []
+    accepted, status, residual = result.accepted.tolist(), result.status.tolist(), result.rms_residual.tolist()
     for b, name in enumerate(samples):
-        status = Status(int(result.status[b])).label
-        rms = f" {_rms(1e3 * float(result.rms_residual[b])):>9}"
-        head = f"{name:>8}  {status:<13} {'yes' if result.accepted[b] else 'no':<4}"
-        present = [k for k in range(len(force[b])) if (b, k) in loads]
-        if not present:
-            none = "no load" if status != "invalid" else "-"
+        label, rms = Status(status[b]).label, f" {_rms(1e3 * residual[b]):>9}"
+        head = f"{one_line(name):>8}  {label:<13} {'yes' if accepted[b] else 'no':<4}"
+        if b not in loads:
+            none = "no load" if label != "invalid" else "-"
             lines.append(f"{head}{'-':>4}{none:>{widths[0]}}{'':>{sum(widths[1:])}}{rms}")
-        for k in present:
-            lines.append(f"{head if k == present[0] else '':<28}{k + 1:>4}{loads[b, k]}{rms}")
+        for i, load in enumerate(loads.get(b, [])):
+            lines.append(f"{'' if i else head:<28}{load}{rms}")
         lines += _further(result, b, noise)
-        if not result.accepted[b] or diagnosis.message(b):
-            notes.append(f"sample {name}: {result.message(b)} {diagnosis.message(b)}".rstrip())
-    return "\n".join([*lines, *notes])
+    return lines
 
 
 def _rms(millimetres: float) -> str:

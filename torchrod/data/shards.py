@@ -3,6 +3,7 @@
     shard-00000.npz    the arrays of data.dataset.ARRAYS; the same arrays make the same file, byte for byte
     shard-00000.json   its checksum; written after it, so a shard without a sidecar is not finished
     manifest.json      specification, units and checksums; written by whoever finds all sidecars
+    spec.json          until then: the checksum of the first job's specification; whoever has another is refused
 
 Every file is written beside its place and then moved there, so that a reader sees all of it or nothing. No two jobs of a cluster
 share a file but the manifest, which is the same whoever writes it. Every refusal is one sentence with file and remedy.
@@ -10,8 +11,10 @@ share a file but the manifest, which is the same whoever writes it. Every refusa
 
 import hashlib
 import json
+import os
+import uuid
 import zipfile
-import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +26,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..io.json_file import put_json
+from ..io.npz_file import UNREADABLE, read_arrays
 from ..mechanics.robot import Robot
 from ..mechanics.rod import Rod
 from ..mechanics.tendons import Tendon, Tendons
@@ -30,8 +34,7 @@ from ..util.errors import InputError
 from ..util.files import put, writing
 from .dataset import ARRAYS, SCHEMA, DatasetSpec, digest
 
-MANIFEST = "manifest.json"
-UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
+MANIFEST, CLAIM = "manifest.json", "spec.json"
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,14 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     """The table in a JSON file, None where there is none."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return content if isinstance(content, dict) else None
 
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in ARRAYS}
+    found = read_arrays(path)
+    return {name: found[name] for name in ARRAYS}
 
 
 def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
@@ -93,50 +96,80 @@ def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
             raise InputError(f"{folder}: is a file; give a folder")
         folder.mkdir(parents=True, exist_ok=True)
     for path in (folder / MANIFEST, *sorted(folder.glob("shard-*.json"))):
-        content = _read_json(path)
-        if content is not None and content.get("spec_sha256") != spec.sha256():
-            raise InputError(
-                f"{folder}: holds a data set of another specification ({path.name}); choose another folder or empty it"
-            )
+        _check_spec(folder, path, spec)
+    _claim(folder, spec)
+
+
+def _check_spec(folder: Path, path: Path, spec: DatasetSpec) -> None:
+    content = _read_json(path)
+    if content is not None and content.get("spec_sha256") != spec.sha256():
+        raise InputError(f"{folder}: holds a data set of another specification ({path.name}); choose another folder or empty it")
+
+
+def _claim(folder: Path, spec: DatasetSpec) -> None:
+    """Say in the folder whose it is, before the first shard: of jobs that begin together the first is the one. Errors: InputError.
+
+    A link to a whole file is made or refused at once, on one machine and over the network.
+    """
+    path, beside = folder / CLAIM, folder / f".{uuid.uuid4().hex}"
+    if _read_json(path) is None:
+        try:
+            put_json(beside, {"schema": SCHEMA, "spec_sha256": spec.sha256()})
+            if path.exists():  # it cannot be read, so it says nothing
+                beside.replace(path)
+            else:
+                os.link(beside, path)
+        except FileExistsError:
+            pass  # another job was first
+        except OSError:  # a file system without links
+            put_json(path, {"schema": SCHEMA, "spec_sha256": spec.sha256()})
+        finally:
+            with suppress(OSError):
+                beside.unlink(missing_ok=True)
+    _check_spec(folder, path, spec)
 
 
 def write_shard(folder: Path, spec: DatasetSpec, index: int, arrays: dict[str, np.ndarray]) -> None:
     """A shard and, once it is there, its sidecar."""
     put(shard_path(folder, index), lambda file: _write_npz(file, arrays))
-    record = {
+    put_json(shard_path(folder, index, ".json"), {"torchrod": version("torchrod"), **_sidecar(spec, index, arrays)})
+
+
+def _sidecar(spec: DatasetSpec, index: int, arrays: dict[str, np.ndarray]) -> dict[str, object]:
+    """What a sidecar says of its shard, but for the version that made it."""
+    return {
         "schema": SCHEMA,
-        "torchrod": version("torchrod"),
         "spec_sha256": spec.sha256(),
-        "file": shard_path(folder, index).name,
+        "file": shard_path(Path(), index).name,
         "robot": spec.robot_of(index).name,
         "samples": len(arrays["force"]),
         "rejected": int(arrays["rejected"]),
         "sha256": digest(arrays),
     }
-    put_json(shard_path(folder, index, ".json"), record)
 
 
 def has_shard(folder: Path, spec: DatasetSpec, index: int) -> bool:
-    """Whether the shard is there, of this specification, and its contents have the checksum of its sidecar."""
+    """Whether the shard is there, of this specification, and its sidecar says of it what it is."""
     record = _read_json(shard_path(folder, index, ".json"))
-    if record is None or record.get("spec_sha256") != spec.sha256():
+    if record is None or not isinstance(record.get("torchrod"), str):
         return False
     try:
-        return digest(_read_npz(shard_path(folder, index))) == record.get("sha256")
+        said = _sidecar(spec, index, _read_npz(shard_path(folder, index)))
+        return all(record.get(key) == value for key, value in said.items())
     except UNREADABLE:
         return False
 
 
 def write_manifest(folder: Path, spec: DatasetSpec) -> str | None:
     """The manifest from the sidecars, and the digest over all shards; None, and nothing is written, while one is missing."""
+    keys = ("file", "robot", "samples", "rejected", "sha256")
     records = [_read_json(shard_path(folder, index, ".json")) for index in range(spec.shards)]
-    shards = [r for r in records if r is not None and r.get("spec_sha256") == spec.sha256()]
+    shards = [r for r in records if r is not None and r.get("spec_sha256") == spec.sha256() and r.keys() >= {"torchrod", *keys}]
     if len(shards) < spec.shards:
         return None
-    keys = ("file", "robot", "samples", "rejected", "sha256")
     content = {
         "schema": SCHEMA,
-        "torchrod": ", ".join(sorted({r["torchrod"] for r in shards})),
+        "torchrod": ", ".join(sorted({str(r["torchrod"]) for r in shards})),
         "digest": _over_all(shards),
         "seed": spec.seed,
         "samples": spec.samples,
@@ -146,11 +179,13 @@ def write_manifest(folder: Path, spec: DatasetSpec) -> str | None:
         "shards": [{key: r[key] for key in keys} for r in shards],
     }
     put_json(folder / MANIFEST, content)
+    with suppress(OSError):  # the manifest says whose the folder is from now on
+        (folder / CLAIM).unlink(missing_ok=True)
     return content["digest"]
 
 
 def _over_all(shards: list[dict[str, Any]]) -> str:
-    return hashlib.sha256("".join(record["sha256"] for record in shards).encode()).hexdigest()
+    return hashlib.sha256("".join(str(record["sha256"]) for record in shards).encode()).hexdigest()
 
 
 def _robot(record: dict[str, Any]) -> Robot:
@@ -187,7 +222,7 @@ def read_dataset(folder: str | Path, verify: bool = False) -> Dataset:
             raise InputError(f"{folder / MANIFEST}: has schema {manifest['schema']}, not {SCHEMA}; make the data set again")
         spec, shards = _spec(manifest["spec"]), manifest["shards"]
         sound = spec.sha256() == manifest["spec_sha256"] and _over_all(shards) == manifest["digest"]
-    except (KeyError, TypeError, ValueError, AttributeError):
+    except UNREADABLE:
         sound, spec, shards = False, None, []
     if spec is None or not sound or len(shards) != spec.shards:
         raise InputError(f"{folder / MANIFEST}: is damaged; run torchrod simulate-dataset again to write it anew")

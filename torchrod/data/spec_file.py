@@ -8,7 +8,7 @@ from typing import Any
 from ..io.robot_file import read_robot
 from ..io.values import as_number, as_numbers, as_table, read_toml
 from ..mechanics.robot import Robot
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from .dataset import DISTRIBUTIONS, FAMILIES, DatasetSpec, Range
 
 KEYS = {
@@ -26,27 +26,27 @@ STANDARD_GRAVITY = 9.81  # m/s^2
 
 def _integer(where: str, value: object, least: int, most: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise InputError(f"{where} is {value!r}; it must be a whole number from {least} to {most}")
+        raise InputError(f"{where} is {shown(value)}; it must be a whole number from {least} to {most}")
     return value
 
 
 def _choice(where: str, value: object, known: Sequence[str]) -> str:
     if not isinstance(value, str) or value not in known:
-        raise InputError(f"{where} is {value!r}; it must be {' or '.join(repr(k) for k in known)}")
+        raise InputError(f"{where} is {shown(value)}; it must be {' or '.join(repr(k) for k in known)}")
     return value
 
 
 def _range(where: str, value: object, most: float | None = None, positive: bool = False) -> Range:
     """[lowest, highest], not negative."""
     if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f"{where} is {value!r}; it must be [lowest, highest], two numbers")
+        raise InputError(f"{where} is {shown(value)}; it must be [lowest, highest], two numbers")
     low, high = as_numbers(where, value, 2)
     if low > high:
-        raise InputError(f"{where} is {value!r}; the lowest comes first")
+        raise InputError(f"{where} is {shown(value)}; the lowest comes first")
     if low < 0 or (positive and low == 0):
-        raise InputError(f"{where} is {value!r}; its lowest must be {'positive' if positive else 'at least 0'}")
+        raise InputError(f"{where} is {shown(value)}; its lowest must be {'positive' if positive else 'at least 0'}")
     if most is not None and high > most:
-        raise InputError(f"{where} is {value!r}; its highest must be at most {most:g}, a fraction of the rod's length")
+        raise InputError(f"{where} is {shown(value)}; its highest must be at most {most:g}, a fraction of the rod's length")
     return low, high
 
 
@@ -93,7 +93,7 @@ def _markers(where: str, table: dict[str, Any]) -> tuple[float, ...]:
         return tuple((i + 1) / count for i in range(count))
     at = table["at"]
     if not isinstance(at, list) or not at:
-        raise InputError(f"{where}.at is {at!r}; it must be a list of fractions of the length")
+        raise InputError(f"{where}.at is {shown(at)}; it must be a list of fractions of the length")
     at = as_numbers(f"{where}.at", at, len(at))
     if any(not 0 <= v <= 1 for v in at) or any(b <= a for a, b in pairwise(at)):
         raise InputError(f"{where}.at must increase and lie between 0 (the base) and 1 (the tip)")
@@ -106,7 +106,7 @@ def _robots(path: Path, table: dict[str, Any]) -> tuple[Robot, ...]:
     names = [table[key]] if key == "file" else table[key]
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
         what = "a file name" if key == "file" else "a list of file names"
-        raise InputError(f"{where}.{key} is {table[key]!r}; it must be {what}, relative to this file")
+        raise InputError(f"{where}.{key} is {shown(table[key])}; it must be {what}, relative to this file")
     robots = tuple(read_robot(path.parent / name) for name in names)
     for name, robot in zip(names, robots, strict=True):
         if len(robot.tendons) != len(robots[0].tendons):

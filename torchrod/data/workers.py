@@ -7,6 +7,7 @@ leaves nothing behind but a shard to be computed again.
 import contextlib
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
@@ -49,6 +50,19 @@ def produce(
             progress(spec.samples_in(index))
 
 
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Processes that begin within it ignore Ctrl-C, from their first import on: the command alone has something to say of it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+
+
 def _leave_with_parent() -> None:
     """End this worker process when the command is killed: the pool itself would wait for work for ever."""
     parent = multiprocessing.parent_process()
@@ -66,7 +80,8 @@ def _as_they_come(executor: Executor, width: Callable[[], int], spec: DatasetSpe
     left, running = iter(indices), {}
     while True:
         for index in islice(left, max(0, width() - len(running))):
-            running[executor.submit(simulate_shard, spec, index)] = index
+            with _deaf():  # a task may start a process
+                running[executor.submit(simulate_shard, spec, index)] = index
         if not running:
             return
         done, _ = wait(running, return_when=FIRST_COMPLETED)

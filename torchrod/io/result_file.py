@@ -2,14 +2,14 @@
 
 import json
 import math
-import zipfile
-import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from ..analysis.count import Evidence
@@ -17,36 +17,55 @@ from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
 from ..estimation.load_profile import Profile
 from ..estimation.result import Estimate, FittedRod
-from ..util.errors import InputError
-from ..util.files import put, put_text, reading
+from ..util.errors import InputError, shown
+from ..util.files import put, reading
 from ..util.status import Status
 from .json_file import plain
+from .npz_file import UNREADABLE, why
 
 RESULT_SUFFIXES = (".json", ".npz")
 
 
-def _loads(estimate: Estimate, b: int) -> list[dict[str, object]]:
-    force, net = estimate.force[b].tolist(), estimate.net_force[b].tolist()
-    pair = estimate.magnitude_location_covariance[b]
+# What a record is made of: worked out once for the whole batch, and turned to plain numbers once.
+COLUMNS = (
+    *("force", "net_force", "magnitude", "magnitude_std", "magnitude_interval", "location", "location_std", "location_interval"),
+    *("width", "magnitude_location_covariance", "rms_residual", "status", "accepted", "iterations", "restarts", "warm_started"),
+    *("chi2", "dof", "base_wrench", "tip", "registration", "tension", "tension_std"),
+)
+Columns = dict[str, list[Any]]
+
+
+def _columns(estimate: Estimate) -> Columns:
+    found = {name: getattr(estimate, name) for name in COLUMNS}
+    if estimate.tip_covariance is not None:
+        found["tip_std"] = estimate.tip_covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+    if bool(estimate.outlier.any()):
+        found["outlier"] = estimate.outlier
+    return {name: value.tolist() for name, value in found.items() if value is not None}
+
+
+def _numbers(value: object) -> str:
+    """JSON of numbers by their names, with null for what is not known: JSON has no NaN and no infinity."""
+    text = json.dumps(value)
+    if "NaN" in text or "Infinity" in text:
+        text = text.replace("NaN", "null").replace("-Infinity", "null").replace("Infinity", "null")
+    return text
+
+
+def _loads(of: Columns, b: int) -> list[dict[str, object]]:
     return [
         {
-            "force_local_N": [plain(v) for v in force[k]],
-            "magnitude_N": plain(float(estimate.magnitude[b, k])),
-            "location_m": plain(float(estimate.location[b, k])),
-            "width_m": plain(float(estimate.width[b, k])),
-            "net_force_local_N": [plain(v) for v in net[k]],
-            "covariance": [[plain(v) for v in row] for row in pair[k].tolist()],
-            "std": {
-                "magnitude_N": plain(float(estimate.magnitude_std[b, k])),
-                "location_m": plain(float(estimate.location_std[b, k])),
-            },
-            "interval_95": {
-                "magnitude_N": [plain(v) for v in estimate.magnitude_interval[b, k].tolist()],
-                "location_m": [plain(v) for v in estimate.location_interval[b, k].tolist()],
-            },
+            "force_local_N": force,
+            "magnitude_N": of["magnitude"][b][k],
+            "location_m": of["location"][b][k],
+            "width_m": of["width"][b][k],
+            "net_force_local_N": of["net_force"][b][k],
+            "covariance": of["magnitude_location_covariance"][b][k],
+            "std": {"magnitude_N": of["magnitude_std"][b][k], "location_m": of["location_std"][b][k]},
+            "interval_95": {"magnitude_N": of["magnitude_interval"][b][k], "location_m": of["location_interval"][b][k]},
         }
-        for k in range(len(force))
-        if not math.isnan(force[k][0])
+        for k, force in enumerate(of["force"][b])
+        if not math.isnan(force[0])
     ]
 
 
@@ -54,56 +73,54 @@ def _message(estimate: Estimate, diagnosis: Diagnosis | None, b: int) -> str:
     return f"{estimate.message(b)} {'' if diagnosis is None else diagnosis.message(b)}".rstrip()
 
 
-def result_record(estimate: Estimate, b: int, sample: str, diagnosis: Diagnosis | None = None) -> dict[str, object]:
-    """One sample's entry of RESULT.json."""
-    wrench = [plain(v) for v in estimate.base_wrench[b].tolist()]
-    record: dict[str, object] = {
-        "sample": int(sample)
-        if sample.isascii() and sample.isdecimal() and len(sample) < 16 and str(int(sample)) == sample
-        else sample,
-        "status": Status(int(estimate.status[b])).label,
-        "accepted": bool(estimate.accepted[b]),
-        "message": _message(estimate, diagnosis, b),
-        "iterations": int(estimate.iterations[b]),
-        "restarts": int(estimate.restarts[b]),
-        "warm_started": bool(estimate.warm_started[b]),
-        "chi2": plain(float(estimate.chi2[b])),
-        "dof": int(estimate.dof[b]),
-        "rms_residual_m": plain(float(estimate.rms_residual[b])),
-        "loads": _loads(estimate, b),
-        "base_wrench": {"force_N": wrench[:3], "moment_Nm": wrench[3:]},
+def _record(of: Columns, b: int, sample: str, message: str) -> dict[str, str]:
+    """One sample's entry of RESULT.json: by each key the JSON of its value."""
+    whole = sample.isascii() and sample.isdecimal() and len(sample) < 16 and str(int(sample)) == sample
+    wrench = of["base_wrench"][b]
+    record = {
+        "sample": sample if whole else json.dumps(sample),
+        "status": json.dumps(Status(of["status"][b]).label),
+        "accepted": json.dumps(of["accepted"][b]),
+        "message": json.dumps(message),
+        "iterations": str(of["iterations"][b]),
+        "restarts": str(of["restarts"][b]),
+        "warm_started": json.dumps(of["warm_started"][b]),
+        "chi2": _numbers(of["chi2"][b]),
+        "dof": str(of["dof"][b]),
+        "rms_residual_m": _numbers(of["rms_residual"][b]),
+        "loads": _numbers(_loads(of, b)),
+        "base_wrench": _numbers({"force_N": wrench[:3], "moment_Nm": wrench[3:]}),
     }
-    if estimate.tip is not None and estimate.tip_covariance is not None:
-        tip = [plain(v) for v in estimate.tip[b].tolist()]
-        std = [plain(v) for v in estimate.tip_covariance[b].diagonal().clamp(min=0).sqrt().tolist()]
-        record["tip"] = {"force_N": tip[:3], "moment_Nm": tip[3:], "std": {"force_N": std[:3], "moment_Nm": std[3:]}}
-    if estimate.registration is not None:
-        twist = [plain(v) for v in estimate.registration[b].tolist()]
-        record["registration"] = {"translation_m": twist[:3], "rotation_rad": twist[3:]}
-    if estimate.tension is not None and estimate.tension_std is not None:
-        values, stds = ([plain(v) for v in x[b].tolist()] for x in (estimate.tension, estimate.tension_std))
-        record["tensions"] = {"tension_N": values, "std": {"tension_N": stds}}
-    if bool(estimate.outlier[b].any()):
-        record["outliers"] = [i + 1 for i in estimate.outlier[b].nonzero().flatten().tolist()]
+    if "tip_std" in of:
+        tip, std = of["tip"][b], of["tip_std"][b]
+        spread = {"force_N": std[:3], "moment_Nm": std[3:]}
+        record["tip"] = _numbers({"force_N": tip[:3], "moment_Nm": tip[3:], "std": spread})
+    if "registration" in of:
+        twist = of["registration"][b]
+        record["registration"] = _numbers({"translation_m": twist[:3], "rotation_rad": twist[3:]})
+    if "tension_std" in of:
+        record["tensions"] = _numbers({"tension_N": of["tension"][b], "std": {"tension_N": of["tension_std"][b]}})
+    if "outlier" in of and any(of["outlier"][b]):
+        record["outliers"] = json.dumps([i + 1 for i, left in enumerate(of["outlier"][b]) if left])
     return record
 
 
-def _rounded(value: Tensor, largest: float) -> list[object]:
-    """Numbers for a person to read, to five digits of the largest; null for the unknown."""
-    if value.ndim > 1:
-        return [_rounded(v, largest) for v in value]
-    places = 5 - math.ceil(math.log10(largest)) if largest > 0 else 0
-    return [round(v, places) + 0.0 if math.isfinite(v) else None for v in value.tolist()]
+def _rounded(value: np.ndarray, largest: float) -> list[object]:
+    """Numbers for a person to read, to five digits of the largest."""
+    unit = 10.0 ** (5 - math.ceil(math.log10(largest)) if largest > 0 else 0)
+    return (np.rint(value * unit) / unit + 0.0).tolist() if math.isfinite(unit) and unit > 0 else value.tolist()
 
 
-def _profile(profile: Profile) -> str:
-    """The load profile of one sample on one line: a number to a line would be 800 lines."""
-    largest = float(torch.cat([profile.f.flatten(), profile.band.flatten()]).nan_to_num(0.0).abs().max())
-    band = {name: _rounded(profile.band[:, i], largest) for i, name in enumerate(("fx", "fy", "magnitude"))}
-    f = _rounded(profile.f, largest)
-    known = f[0] is not None and bool(torch.isfinite(profile.f).all())
-    content = {"s_m": _rounded(profile.s, float(profile.s.max())), "f_local_N_per_m": f, "band_95": band}
-    return json.dumps(content if known else None, separators=(",", ":"))
+def _profile(profile: Profile, b: int) -> str:
+    """The load profile of one sample on one line: a number to a line would be 800 lines. Null where f or a band is not known."""
+    s, f, band = profile.s.numpy(), profile.f[b].numpy(), profile.band[b].numpy()
+    if not np.isfinite(f).all():
+        return "null"
+    seen = [np.abs(f).max(initial=0.0), np.abs(band[np.isfinite(band)]).max(initial=0.0)]
+    largest = float(max(seen))
+    of = {name: _rounded(band[:, i], largest) for i, name in enumerate(("fx", "fy", "magnitude"))}
+    content = {"s_m": _rounded(s, float(s.max())), "f_local_N_per_m": _rounded(f, largest), "band_95": of}
+    return _numbers(content)
 
 
 def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
@@ -114,6 +131,36 @@ def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
         "not_converged": [name for name, value, _ in rows if math.isinf(value)],
         "bic_foreseen": {name: plain(promised) for name, value, promised in rows if math.isnan(value)},
     }
+
+
+def _texts(
+    estimate: Estimate,
+    samples: list[str],
+    evidence: Evidence | None,
+    profile: Profile | None,
+    diagnosis: Diagnosis | None,
+    noise: Noise | None,
+) -> Iterator[str]:
+    """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
+    of = _columns(estimate)
+    for b, name in enumerate(samples):
+        record = _record(of, b, name, _message(estimate, diagnosis, b))
+        if evidence is not None:
+            record["evidence"] = json.dumps(_evidence(evidence, b))
+        if diagnosis is not None:
+            record["suspect_markers"] = json.dumps(diagnosis.suspects(b))
+        if noise is not None:
+            record["noise"] = _numbers({"noise_m": float(noise.sigma[b]), "std_m": float(noise.std[b])})
+        if profile is not None:
+            record["profile"] = _profile(profile, b)
+        yield "{\n" + ",\n".join(f' "{key}": {text}' for key, text in record.items()) + "\n}"
+
+
+def _stream(file: IO[bytes], robot: str, texts: Iterator[str]) -> None:
+    file.write(f'{{"robot": {robot}, "results": [\n'.encode())
+    for b, text in enumerate(texts):
+        file.write((",\n" * (b > 0) + text).encode())
+    file.write(b"\n]}\n")
 
 
 def write_result(
@@ -130,23 +177,16 @@ def write_result(
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
-    Errors: InputError for another suffix, and where the file cannot be written.
+    Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
         raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
+    if len(samples) != len(estimate.status):
+        raise InputError(f"{path}: {len(samples)} names for {len(estimate.status)} samples; give every sample its name")
     if path.suffix == ".json":
-        records = [result_record(estimate, b, name, diagnosis) for b, name in enumerate(samples)]
-        for b, record in enumerate(records if evidence is not None else ()):
-            record["evidence"] = _evidence(evidence, b)  # pyright: ignore[reportArgumentType]
-        for b, record in enumerate(records if diagnosis is not None else ()):
-            record["suspect_markers"] = diagnosis.suspects(b)  # pyright: ignore[reportOptionalMemberAccess]
-        for b, record in enumerate(records if noise is not None else ()):
-            record["noise"] = {"noise_m": plain(float(noise.sigma[b])), "std_m": plain(float(noise.std[b]))}  # pyright: ignore[reportOptionalMemberAccess]
-        texts = [json.dumps(record, indent=1) for record in records]
-        if profile is not None:
-            texts = [f'{text[:-2]},\n "profile": {_profile(profile.of(b))}\n}}' for b, text in enumerate(texts)]
-        put_text(path, f'{{"robot": {json.dumps(robot)}, "results": [\n' + ",\n".join(texts) + "\n]}\n")
+        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise)
+        put(path, lambda file: _stream(file, json.dumps(robot), texts))
         return
     said, which = np.unique([_message(estimate, diagnosis, b) for b in range(len(samples))], return_inverse=True)
     names = {"sample": np.array(samples), "robot": np.array(robot), "messages": said, "message": which}
@@ -167,12 +207,13 @@ def write_result(
 
 @dataclass(frozen=True)
 class _Asked:
-    """Which fit of which file, and what it has to be of where that is known: the robot's name, the number of markers."""
+    """Which fit of which file, and what it has to be of where that is known: the robot's name, its length (m), how many markers."""
 
     path: Path
     sample: str
     robot: str | None
     markers: int | None
+    length: float | None
 
     def index(self, names: list[str]) -> int:
         if self.sample not in names:
@@ -182,9 +223,21 @@ class _Asked:
     def check(self, robot: object, markers: int | None) -> None:
         """Refuse a result of another robot or of other shapes; None in the file goes through."""
         if None not in (robot, self.robot) and robot != self.robot:
-            raise InputError(f"{self.path}: is of robot {robot!r}, not of {self.robot!r}; give the robot that was estimated")
+            raise InputError(f"{self.path}: is of robot {shown(robot)}, not of {self.robot!r}; give the robot that was estimated")
         if None not in (markers, self.markers) and markers != self.markers:
             raise InputError(f"{self.path}: is of {markers} markers, not of {self.markers}; give the shapes that were estimated")
+
+    def check_places(self, fit: FittedRod) -> None:
+        """Refuse loads where this robot has no rod: its length or its unit has been changed since."""
+        places = [fit.location] if fit.profile is None else [fit.location, fit.profile.s]
+        farthest = max([float(p.max()) for p in places if p.numel()], default=0.0)
+        nearest = min([float(p.min()) for p in places if p.numel()], default=0.0)
+        if self.length is not None and not (nearest >= 0 and farthest <= self.length * (1 + 1e-6)):
+            place = farthest if nearest >= 0 else nearest
+            raise InputError(
+                f"{self.path}: has loads at s = {place:g} m, and the rod runs from 0 to {self.length:g} m; "
+                "give the robot as it was when the loads were estimated, or estimate them again"
+            )
 
 
 def _there(values: list[float | None]) -> list[float | None] | None:
@@ -192,44 +245,80 @@ def _there(values: list[float | None]) -> list[float | None] | None:
     return None if all(v is None or math.isnan(v) for v in values) else values
 
 
-def _arrays_of(asked: _Asked, opened: IO[bytes]) -> tuple[list[object], list[object] | None]:
-    """What a figure needs of a RESULT.npz: force, location, width, base wrench, registration, tip force, intervals; the profile."""
+Values = dict[str, object]
+
+
+def _arrays_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]:
+    """What a figure needs of a RESULT.npz; the profile."""
     with np.load(opened, allow_pickle=False) as file:
         asked.check(str(file["robot"]) if "robot" in file else None, file["outlier"].shape[1] if "outlier" in file else None)
         b = asked.index([str(n) for n in file["sample"]])
-        values: list[object] = [file[key][b] for key in ("force", "location", "width", "base_wrench")]
-        values.append(file["registration"][b] if "registration" in file else None)
-        values.append(_there(file["tip"][b][:3].tolist()) if "tip" in file else None)
-        values.append(file["location_interval"][b] if "location_interval" in file else None)
+        values: Values = {key: file[key][b] for key in ("force", "location", "width", "base_wrench")}
+        values["registration"] = file["registration"][b] if "registration" in file else None
+        values["tip"] = _there(file["tip"][b][:3].tolist()) if "tip" in file else None
+        values["interval"] = file["location_interval"][b] if "location_interval" in file else None
         if "profile_f" not in file:
             return values, None
-        return values, [file["profile_s"], file["profile_f"][b], file["profile_band"][b]]
+        return values, {"s": file["profile_s"], "f": file["profile_f"][b], "band": file["profile_band"][b]}
 
 
-def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[list[object], list[object] | None]:
+def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]:
     """The same of a RESULT.json."""
     content = json.load(opened)
     results = content["results"]
     asked.check(content.get("robot"), None)
     record = results[asked.index([str(r["sample"]) for r in results])]
     loads, wrench = record["loads"], record["base_wrench"]
-    values: list[object] = [[load[key] for load in loads] for key in ("force_local_N", "location_m", "width_m")]
-    values.append([*wrench["force_N"], *wrench["moment_Nm"]])
+    keys = {"force": "force_local_N", "location": "location_m", "width": "width_m"}
+    values: Values = {name: [load[key] for load in loads] for name, key in keys.items()}
+    values["base_wrench"] = [*wrench["force_N"], *wrench["moment_Nm"]]
     twist = record.get("registration")
-    values.append(None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]])
-    values.append(_there(record["tip"]["force_N"]) if "tip" in record else None)
-    values.append([load["interval_95"]["location_m"] for load in loads])
+    values["registration"] = None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]]
+    values["tip"] = _there(record["tip"]["force_N"]) if "tip" in record else None
+    values["interval"] = [load["interval_95"]["location_m"] for load in loads]
     profile = record.get("profile")
     if profile is None:
         return values, None
     band = np.stack([np.array(profile["band_95"][key], dtype=float) for key in ("fx", "fy", "magnitude")], 1)
-    return values, [profile["s_m"], profile["f_local_N_per_m"], band]
+    return values, {"s": profile["s_m"], "f": profile["f_local_N_per_m"], "band": band}
 
 
-def read_fit(path: str | Path, sample: str, robot: str | None = None, markers: int | None = None) -> FittedRod:
+def _tensor(values: Values, name: str, *shape: int) -> Float[Tensor, "..."] | None:
+    """Numbers of a shape; of no number the empty tensor of that shape. Errors: ValueError."""
+    if values[name] is None:
+        return None
+    found = np.array(values[name], dtype=float)
+    if found.size == 0 and 0 in shape:
+        found = found.reshape(shape)
+    if found.shape != shape:
+        raise ValueError(f"{name} has shape {found.shape}, not {shape}")
+    return torch.tensor(found)
+
+
+def _fit_of(values: Values, stored: Values | None) -> FittedRod:
+    K = len(values["location"])  # pyright: ignore[reportArgumentType]
+    force, location, width = _tensor(values, "force", K, 2), _tensor(values, "location", K), _tensor(values, "width", K)
+    wrench, zeta, tip = (_tensor(values, name, n) for name, n in (("base_wrench", 6), ("registration", 6), ("tip", 3)))
+    interval, profile = _tensor(values, "interval", K, 2), None
+    if force is None or location is None or width is None or wrench is None:
+        raise ValueError("its loads are null")
+    if stored is not None:
+        S = len(stored["s"])  # pyright: ignore[reportArgumentType]
+        s, f, band = _tensor(stored, "s", S), _tensor(stored, "f", S, 2), _tensor(stored, "band", S, 3, 2)
+        if s is None or f is None or band is None:
+            raise ValueError("its profile has no numbers")
+        profile = Profile(s, f, band)
+    there = torch.isfinite(force).all(-1)
+    interval = None if interval is None else interval[there]
+    return FittedRod(force[there], location[there], width[there], wrench, zeta, tip, interval, profile)
+
+
+def read_fit(
+    path: str | Path, sample: str, robot: str | None = None, markers: int | None = None, length: float | None = None
+) -> FittedRod:
     """One sample of a RESULT.json or RESULT.npz.
 
-    robot, markers: the robot's name and the number of markers; a file that says otherwise is refused.
+    robot, markers, length: the robot's name, the number of markers and the rod's length (m); a file that says otherwise is refused.
     Errors: InputError naming file, sample and remedy.
     """
     path = Path(path)
@@ -237,33 +326,18 @@ def read_fit(path: str | Path, sample: str, robot: str | None = None, markers: i
         if not path.is_file():
             raise InputError(f"{path}: no such file; write it with torchrod estimate --out")
         with path.open("rb") as opened:
-            return _read_fit(_Asked(path, sample, robot, markers), opened)
+            return _read_fit(_Asked(path, sample, robot, markers, length), opened)
 
 
 def _read_fit(asked: _Asked, opened: IO[bytes]) -> FittedRod:
     try:
-        values, stored = (_arrays_of if asked.path.suffix == ".npz" else _record_of)(asked, opened)
-        *loads, wrench, zeta, tip, interval = [None if v is None else torch.tensor(np.array(v, dtype=float)) for v in values]
-        profile = None if stored is None else Profile(*(torch.tensor(np.array(v, dtype=float)) for v in stored))
-        force, location, width = (t.reshape(-1, 2) if i == 0 else t for i, t in enumerate(loads) if t is not None)
-        there = torch.isfinite(force).all(-1)
-        loads = [force[there], location[there], width[there]]
-        interval = None if interval is None else interval.reshape(-1, 2)[there]
+        fit = _fit_of(*(_arrays_of if asked.path.suffix == ".npz" else _record_of)(asked, opened))
     except InputError:
         raise
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        IndexError,
-        AttributeError,
-        EOFError,
-        OSError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
-        raise InputError(f"{asked.path}: is not a result of torchrod estimate ({error}); write it with --out") from None
-    if not all(bool(torch.isfinite(t).all()) for t in [*loads, wrench, zeta, tip] if t is not None):
+    except UNREADABLE as error:
+        raise InputError(f"{asked.path}: is not a result of torchrod estimate ({why(error)}); write it with --out") from None
+    numbers = [fit.force, fit.location, fit.width, fit.base_wrench, fit.registration, fit.tip_force]
+    if not all(bool(torch.isfinite(t).all()) for t in numbers if t is not None) or bool((fit.width < 0).any()):
         raise InputError(f"{asked.path}: sample {asked.sample} has no fit to draw; see its message")
-    assert wrench is not None
-    return FittedRod(loads[0], loads[1], loads[2], wrench, zeta, tip, interval, profile)
+    asked.check_places(fit)
+    return fit

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from ..mechanics.robot import Robot
-from ..mechanics.rod import Rod
+from ..mechanics.rod import Rod, check_stiffness
 from ..mechanics.tendons import Tendon, Tendons
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.precision import DTYPE
 from .values import as_number, as_numbers, as_rows, as_table, read_toml
 
@@ -27,6 +27,8 @@ ROD_KEYS = {
     "K_bt",
 }
 SECTION_KEYS = ("diameter", "youngs_modulus", "shear_modulus")
+SOFTEST, HARDEST = 1e4, 2e12  # Pa: below the softest silicone and above diamond
+RUBBER, SLENDER = 1e6, 1 / 40  # Pa, and a diameter over the length: so soft and so slender a rod does not hold itself
 TENDON_KEYS = {"offset", "routing", "ends_at", "tension_offset"}
 
 
@@ -37,9 +39,11 @@ def _stiffness(where: str, value: object) -> torch.Tensor:
     elif isinstance(value, list) and len(value) == 3:
         K = torch.diag(torch.tensor(as_numbers(where, value, 3), dtype=DTYPE))
     else:
-        raise InputError(f"{where} is {value!r}; it must be three numbers (the diagonal) or three rows of three numbers")
-    if not torch.allclose(K, K.mT, rtol=1e-6, atol=0) or int(torch.linalg.cholesky_ex(K).info) != 0:
-        raise InputError(f"{where} must be symmetric positive definite, in N (K_se) or N m^2 (K_bt)")
+        raise InputError(f"{where} is {shown(value)}; it must be three numbers (the diagonal) or three rows of three numbers")
+    try:
+        check_stiffness(where, K, "N (K_se) or N m^2 (K_bt)")
+    except ValueError as error:
+        raise InputError(str(error)) from None
     return K
 
 
@@ -73,8 +77,16 @@ def _rod(path: Path, table: dict[str, Any]) -> Rod:
         if key not in table:
             raise InputError(f"{where}.{key} is missing; give diameter, youngs_modulus and shear_modulus, or K_se and K_bt")
     diameter, E, G = (as_number(f"{where}.{k}", table[k], positive=True) for k in SECTION_KEYS)
-    if not 1e-5 * length <= diameter <= length or E < 1e3 or not 0.1 * E <= G <= E:
+    if not SOFTEST <= E <= HARDEST:
+        remedy = "is it in GPa or MPa? steel is 207e9" if E < SOFTEST else "steel is 207e9"
+        raise InputError(f"{where}.youngs_modulus is {E:g} Pa, which no rod has; give it in pascals ({remedy})")
+    if not 1e-5 * length <= diameter <= length or not 0.1 * E <= G <= E:
         warnings.warn(f"{where}: diameter {diameter} m, youngs_modulus {E} Pa, shear_modulus {G} Pa: check the units", stacklevel=2)
+    elif E < RUBBER and diameter < SLENDER * length:
+        warnings.warn(
+            f"{where}.youngs_modulus is {E:g} Pa, that of soft rubber, in a slender rod; if it is in MPa, give {1e6 * E:g} Pa",
+            stacklevel=2,
+        )
     return Rod.circular(length, diameter, E, G, mass, rows)
 
 
@@ -118,7 +130,7 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
     name = content.get("name", path.stem)
     if not isinstance(name, str):
-        raise InputError(f"{path}: name is {name!r}; it must be a text in quotes")
+        raise InputError(f"{path}: name is {shown(name)}; it must be a text in quotes")
     listed = content.get("tendons", [])
     if not isinstance(listed, list):
         raise InputError(f"{path}: tendons must be an array of tables, [[tendons]]")

@@ -3,27 +3,31 @@
 import csv
 import io
 import math
-import zipfile
-import zlib
+import re
+import warnings
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..mechanics.grid import on_rod
 from ..mechanics.robot import Robot
-from ..model.marker_geometry import too_far, too_short
+from ..model.marker_geometry import at_origin, too_far, too_short
 from ..model.sensors import Markers
-from ..util.errors import InputError
-from ..util.files import put_text, reading
+from ..util.errors import InputError, shown
+from ..util.files import put, reading
 from ..util.precision import Float64
+from .npz_file import UNREADABLE, read_arrays, why
 
 REQUIRED = ("s", "x", "y", "z")
 OFFSETS = ("rx", "ry", "rz")
+SLACK = 0.05  # of the largest tension in the file: a load cell's zero may drift by so much
+DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,8 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
             raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
         with path.open("rb") as file:
             shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
-    markers, L = shapes, robot.rod.length
+    gap, L = at_origin(shapes.markers(1.0)), robot.rod.length
+    markers = replace(shapes, positions=torch.where(gap.unsqueeze(-1), torch.nan, shapes.positions))
     outside = ~on_rod(markers.s, L)
     if bool(outside.any()):
         hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
@@ -68,9 +73,44 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     given = 0 if markers.tension is None else markers.tension.shape[-1]
     if given != T:
         raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; give one per tendon, in N")
-    if markers.tension is not None and bool((markers.tension < 0).any()):
+    _check_pulls(path, markers, robot)
+    if bool(gap.any()):
+        _warn_of_gaps(path, gap, markers.s)
+    return replace(markers, s=markers.s.clamp(0, L))
+
+
+def _warn_of_gaps(path: Path, gap: Bool[Tensor, "B P"], s: Float[Tensor, " P"]) -> None:
+    """Say once which positions are taken as missing."""
+    where = f" in {int(gap.any(-1).sum())} of {len(gap)} samples" if len(gap) > 1 else ""
+    places = gap.any(0).nonzero().flatten()
+    named = ", ".join(f"{1e3 * v:.4g}" for v in s[places[:5]].tolist()) + (", ..." if len(places) > 5 else "")
+    warnings.warn(
+        f"{path}: markers at exactly (0, 0, 0), {int(gap.sum())}{where} (s = {named} mm), are taken as missing; "
+        "leave the cells of a missing marker empty",
+        stacklevel=3,
+    )
+
+
+def _check_pulls(path: Path, markers: Shapes, robot: Robot) -> None:
+    """A tendon can only pull. A load cell's reading may lie a little below zero, and is then that of a slack tendon (a warning);
+    one that mostly does so by more than its zero may drift counts the other way, and is refused.
+    """
+    if markers.tension is None or not markers.tension.numel():
+        return
+    offset = markers.tension.new_tensor([t.tension_offset for t in robot.tendons.tendons]).clamp(min=0)
+    pull = markers.tension + offset  # what a known offset makes positive is none of this
+    below = pull < 0
+    if not bool(below.any()):
+        return
+    mostly = 2 * below.sum(0) > len(pull)
+    far = pull.amin(0) < -SLACK * max(float(pull.max()), 0.0)
+    if bool((mostly & far).any()):
         raise InputError(f"{path}: tension {float(markers.tension.min()):g} N is negative; a tendon can only pull, give at least 0")
-    return replace(shapes, s=shapes.s.clamp(0, L))
+    warnings.warn(
+        f"{path}: negative tensions, {int(below.sum())} in {int(below.any(-1).sum())} of {len(pull)} samples, down to "
+        f"{float(markers.tension.min()):g} N, are taken as those of slack tendons, which carry nothing",
+        stacklevel=3,
+    )
 
 
 def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: str) -> None:
@@ -89,11 +129,9 @@ def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: s
 
 def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
     try:
-        with np.load(file, allow_pickle=False) as arrays:
-            data = {key: np.asarray(arrays[key]) for key in arrays.files}
-    except (ValueError, TypeError, AttributeError, OSError, zipfile.BadZipFile, zlib.error, EOFError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: is not an NPZ of plain numbers ({reason}); save numeric arrays only") from None
+        data = read_arrays(file)
+    except UNREADABLE as error:
+        raise InputError(f"{path}: is not an NPZ of plain numbers ({why(error)}); save numeric arrays only") from None
     expected = {"s": "(P,)", "positions": "(B, P, 3)", "tensions": "(B, T)", "offsets": "(P, 3)"}
     for key, value in data.items():
         if key not in expected:
@@ -126,13 +164,49 @@ def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
     return Shapes(tensor["s"], tensor["positions"], names, tensor.get("offsets"), tensor.get("tensions"))
 
 
-def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
+def _without_comments(lines: Iterable[str], comments: list[str]) -> Iterator[str]:
+    """The lines, those that begin with # emptied and collected; not within quotes, where a line goes on."""
+    quoted = False
+    for line in lines:
+        if not quoted and line.lstrip().startswith("#"):
+            comments.append(line.lstrip()[1:])
+            yield "\n"  # a line all the same: refusals count them
+            continue
+        quoted ^= line.count('"') % 2 == 1
+        yield line
+
+
+def _delimiter(header: str) -> str:
+    """Of a CSV, by its header: a comma, or what spreadsheets put where the comma is the decimal mark."""
+    return next((mark for mark in (",", ";", "\t") if mark in header), ",")
+
+
+def _names(cells: list[str]) -> list[str]:
+    return [name.strip().lower() for name in cells]
+
+
+def _rows(path: Path, file: IO[bytes]) -> tuple[list[tuple[int, list[str]]], bool]:
+    """The numbered rows of cells, header first, and whether a comma is their decimal mark."""
+    comments: list[str] = []
     try:
-        reader = csv.reader(io.TextIOWrapper(file, newline="", encoding="utf-8-sig"))
-        numbered = [(reader.line_num, row) for row in reader if row]
+        text = file.read().decode("utf-8-sig")
+        lines = list(_without_comments(io.StringIO(text, newline=""), comments))
+        first = next((line for line in lines if line.strip()), "")
+        mark, header = _delimiter(first), None
+        reader = csv.reader(lines, delimiter=mark)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+        if comments and not set(REQUIRED) <= set(_names(rows[0][1] if rows else [])):  # as numpy.savetxt puts a header
+            header = next((c for c in comments if set(REQUIRED) <= set(_names(next(csv.reader([c], delimiter=mark), [])))), None)
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path}: is not a CSV text file; expected the header s,x,y,z") from None
-    header = [name.strip() for name in numbered[0][1]] if numbered else []
+    if header is not None:
+        rows.insert(0, (0, next(csv.reader([header], delimiter=mark))))
+    return rows, mark != ","
+
+
+def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
+    numbered, comma = _rows(path, file)
+    header = _names(numbered[0][1]) if numbered else []
     _check_header(path, header)
     if len(numbered) < 2:
         raise InputError(f"{path}: has a header but no rows; give one row per marker")
@@ -144,7 +218,7 @@ def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
             )
         cells = dict(zip(header, row, strict=True))
         name = cells.pop("sample", "0").strip()
-        samples.setdefault(name, []).append({key: _cell(path, number, key, text) for key, text in cells.items()})
+        samples.setdefault(name, []).append({key: _cell(path, number, key, text, comma) for key, text in cells.items()})
     return _assemble(path, header, samples)
 
 
@@ -157,18 +231,20 @@ def _check_header(path: Path, header: list[str]) -> None:
     for name in header:
         if name not in known or header.count(name) > 1:
             raise InputError(
-                f"{path}: unexpected column '{name}'; known: s,x,y,z,sample,rx,ry,rz and tension_1..tension_T, once each"
+                f"{path}: unexpected column '{name[:80]}'; known: s,x,y,z,sample,rx,ry,rz and tension_1..tension_T, once each"
             )
     if 0 < sum(name in header for name in OFFSETS) < 3:
         raise InputError(f"{path}: rx,ry,rz come together; add the missing one of them")
 
 
-def _cell(path: Path, line: int, key: str, text: str) -> float:
-    """A number; an empty cell or NaN is a missing one, which only a position may be."""
+def _cell(path: Path, line: int, key: str, text: str, comma: bool) -> float:
+    """A number; an empty cell or NaN is a missing one, which only a position may be. comma: it may be the decimal mark."""
+    if comma and DECIMAL_COMMA.fullmatch(text):
+        text = text.replace(",", ".")
     try:
         value = float(text) if text.strip() else math.nan
     except ValueError:
-        raise InputError(f"{path}: line {line}, column {key}: {text.strip()!r} is not a number") from None
+        raise InputError(f"{path}: line {line}, column {key}: {shown(text.strip())} is not a number") from None
     if not math.isfinite(value) and (key not in "xyz" or math.isinf(value)):
         raise InputError(
             f"{path}: line {line}, column {key}: must be a finite number; only x, y, z may be empty (a missing marker)"
@@ -200,14 +276,30 @@ def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, f
 def write_shapes(path: str | Path, shapes: Shapes) -> None:
     """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells. Errors: InputError."""
     markers = shapes
+    if len(shapes.samples) != len(markers.positions):
+        raise InputError(f"{path}: {len(shapes.samples)} names for {len(markers.positions)} samples; give every sample its name")
     tensions = [] if markers.tension is None else [f"tension_{i + 1}" for i in range(markers.tension.shape[-1])]
     header = ["sample", *REQUIRED, *([] if markers.offsets is None else OFFSETS), *tensions]
-    text = io.StringIO()
-    writer = csv.writer(text)
-    writer.writerow(header)
-    for b, name in enumerate(shapes.samples):
-        for i, s in enumerate(markers.s.tolist()):
-            position = ["" if math.isnan(v) else v for v in markers.positions[b, i].tolist()]
-            offset = [] if markers.offsets is None else markers.offsets[i].tolist()
-            writer.writerow([name, s, *position, *offset, *([] if markers.tension is None else markers.tension[b].tolist())])
-    put_text(path, text.getvalue())
+    places = markers.s.tolist()
+    offsets = [[]] * len(places) if markers.offsets is None else markers.offsets.tolist()
+
+    def write(file: IO[bytes]) -> None:
+        for b in range(-1, len(shapes.samples)):
+            text = io.StringIO()
+            writer = csv.writer(text)
+            if b < 0:
+                writer.writerow(header)
+            else:
+                name = _quoted(shapes.samples[b])
+                tension = [] if markers.tension is None else markers.tension[b].tolist()
+                for s, p, offset in zip(places, markers.positions[b].tolist(), offsets, strict=True):
+                    text.write(name + ",")
+                    writer.writerow([s, *("" if math.isnan(v) else v for v in p), *offset, *tension])
+            file.write(text.getvalue().encode())
+
+    put(path, write)
+
+
+def _quoted(name: str) -> str:
+    """A sample's name as a cell that no reader takes for a comment or for several cells."""
+    return '"' + name.replace('"', '""') + '"' if not name or any(c in name for c in ',;\t"#\r\n') else name

@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.files import reading
 
 
@@ -15,7 +15,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     with reading(path):
         try:
             return tomllib.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:  # not TOML, not UTF-8, or a path that is none
+        except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a path that is none
             raise InputError(f"{path}: is not valid TOML ({error}); correct that place (docs/files.md has the keys)") from None
 
 
@@ -32,7 +32,7 @@ def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
 def as_number(where: str, value: object, positive: bool = False, least: float = -math.inf) -> float:
     """A finite number, positive or at least `least` where that is asked for."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{where} is {value!r}; it must be a number in SI units")
+        raise InputError(f"{where} is {shown(value)}; it must be a number in SI units")
     try:
         value = float(value)
     except OverflowError:
@@ -47,7 +47,7 @@ def as_number(where: str, value: object, positive: bool = False, least: float = 
 def as_numbers(where: str, value: object, count: int) -> list[float]:
     """A list of `count` such numbers."""
     if not isinstance(value, list) or len(value) != count:
-        raise InputError(f"{where} is {value!r}; it must be a list of {count} numbers")
+        raise InputError(f"{where} is {shown(value)}; it must be a list of {count} numbers")
     return [as_number(where, v) for v in value]
 
 

@@ -10,7 +10,7 @@
 
         [y, k](grid) = [Kgg, Kkg] (Kss + sigma^2 I)^-1 y_seen,     Kgs = q^2 int g(grid, t) g(s, t) dt, and so on.
 
-    It takes any layout; a marker that is missing has an unbounded sigma.
+    It takes any layout; a marker that is missing is left out.
 
 (3) Size. amp = rms over the grid of the lateral curvature. Deflection and curvature are divided by it: to first order what is left
     depends only on where the load is, and the force is in proportion to amp.
@@ -42,7 +42,7 @@ GRID = 20  # points of the grid
 STATIONS = 4  # where the known loads are described
 NODES = 100  # of the quadrature over the unknown load
 LOAD_STD = 4.0  # q
-MISSING_VARIANCE = 1e6
+MOST_NUMBERS = 2**22  # in the matrices of the patterns that are solved together: 32 MB each
 AMP_LEAST = 1e-6  # a straighter rod has no direction and no size
 PASSIVE_SIZE = 5 * GRID + 6
 ACTIVE_SIZE = PASSIVE_SIZE + STATIONS * 6 + 3
@@ -77,30 +77,30 @@ def is_active(robot: Robot) -> bool:
     return len(robot.tendons) > 0 or not robot.weightless
 
 
-def _beam(s: Float[Tensor, " S"], t: Float[Tensor, " T"]) -> tuple[Float[Tensor, "S T"], Float[Tensor, "S T"]]:
+def _beam(s: Float[Tensor, "... S"], t: Float[Tensor, " T"]) -> tuple[Float[Tensor, "... S T"], Float[Tensor, "... S T"]]:
     """g(s, t) and k(s, t) of (2)."""
     s = s.unsqueeze(-1)
     far = torch.where(s < t, s**2 * (3 * t - s), t**2 * (3 * s - t)) / 6
     return far, (t - s).clamp(min=0)
 
 
-def kriging(s: Float[Tensor, " P"], seen: Bool[Tensor, "U P"], sigma: float) -> Float[Tensor, "U 2G P"]:
-    """(2): what takes displacements to deflection and curvature on the grid, for U patterns of markers seen; all over L. Curvature
-    is that of a step's beginning, so that the base, where it is largest, is among them.
+def kriging(s: Float[Tensor, "U P"], sigma: float) -> Float[Tensor, "U 2G P"]:
+    """(2): what takes displacements to deflection and curvature on the grid, for U layouts of markers; all over L. Curvature is
+    that of a step's beginning, so that the base, where it is largest, is among them.
     """
     t = (torch.arange(NODES, dtype=DTYPE) + 0.5) / NODES
     grid = torch.linspace(1 / GRID, 1, GRID, dtype=DTYPE)
     at_markers, at_grid, bend = _beam(s, t)[0], _beam(grid, t)[0], _beam(grid - 1 / GRID, t)[1]
     q2 = LOAD_STD**2 / NODES
-    variance = torch.where(seen, sigma**2, MISSING_VARIANCE)
-    factor = torch.linalg.cholesky(q2 * at_markers @ at_markers.T + torch.diag_embed(variance))
+    own = q2 * at_markers @ at_markers.mT
+    own.diagonal(dim1=-2, dim2=-1).add_(sigma**2)
     cross = q2 * at_markers @ torch.cat([at_grid, bend]).T
-    return torch.cholesky_solve(cross.expand(len(seen), -1, -1), factor).mT
+    return torch.cholesky_solve(cross, torch.linalg.cholesky(own)).mT
 
 
 def _kriging_of_all(s: Float[Tensor, " P"], length: float, sigma: float) -> Float[Tensor, "1 2G P"]:
     """Where every marker was seen, kept for the next shapes with the same arc lengths."""
-    return _kriged((key(s), length, sigma), lambda: kriging(s / length, torch.ones(1, len(s), dtype=torch.bool), sigma))
+    return _kriged((key(s), length, sigma), lambda: kriging(s[None] / length, sigma))
 
 
 def _places(s: Float[Tensor, " P"], length: float) -> Float[Tensor, " Q"]:
@@ -113,14 +113,31 @@ def smoothed(
     s: Float[Tensor, " P"], y: Float[Tensor, "B P 3"], seen: Bool[Tensor, "B P"], length: float, noise: float
 ) -> tuple[Float[Tensor, "B G 3"], Float[Tensor, "B G 3"]]:
     """(2) from displacements over L; s, length and noise in m. Each pattern of markers seen is solved once."""
-    y = torch.where(seen.unsqueeze(-1), y, 0.0)
     if bool(seen.all()):
         rows = y.mT.flatten(0, 1) @ _kriging_of_all(s, length, noise / length)[0].mT  # one product for all samples
         out = rows.unflatten(0, (-1, 3)).mT
     else:
-        patterns, which = torch.unique(seen, dim=0, return_inverse=True)
-        out = kriging(s / length, patterns, noise / length)[which] @ y
+        out = _smoothed_by_pattern(s / length, y, seen, noise / length)
     return out[:, :GRID], out[:, GRID:]
+
+
+def _smoothed_by_pattern(
+    s: Float[Tensor, " P"], y: Float[Tensor, "B P 3"], seen: Bool[Tensor, "B P"], sigma: float
+) -> Float[Tensor, "B 2G 3"]:
+    """The same with gaps: of each pattern only the markers that were seen, so that samples with arc lengths of their own, each of
+    which sees few of all the markers, take no more memory than these few.
+    """
+    out = y.new_zeros(len(y), 2 * GRID, 3)
+    patterns, which = torch.unique(seen, dim=0, return_inverse=True)
+    order, count = which.argsort(stable=True), patterns.sum(-1)
+    samples = order.split(torch.bincount(which, minlength=len(patterns)).tolist())
+    for n in count.unique().tolist():
+        alike = (count == n).nonzero().squeeze(-1)
+        for some in alike.split(max(1, MOST_NUMBERS // max(n * (n + NODES), 1))) if n else ():
+            at = patterns[some].nonzero()[:, 1].unflatten(0, (len(some), n))
+            for solve, places, u in zip(kriging(s[at], sigma), at, some.tolist(), strict=True):
+                out[samples[u]] = solve @ y[samples[u]][:, places]
+    return out
 
 
 def _canonical(bend: Float[Tensor, "B G 2"], amp: Float[Tensor, " B"]) -> Float[Tensor, "B 2 2"]:
@@ -155,9 +172,10 @@ def features(problem: Problem) -> Features:
     places = _places(markers.s, L)
     rest = without_load(problem, places)
     straight = torch.nn.functional.pad(places.unsqueeze(-1), (2, 0))
-    p0 = torch.where(torch.isfinite(rest.p), rest.p, straight)
+    known = torch.isfinite(rest.p)
+    p0 = rest.p if bool(known.all()) else torch.where(known, rest.p, straight)  # as a rule one shape, expanded to all samples
     sigma = torch.tensor(noise / L, dtype=DTYPE)
-    y, k = smoothed(markers.s, (markers.positions - p0[:, :P]) / L, seen, L, noise)
+    y, k = smoothed(markers.s, (markers.positions - p0[:, :P]).div_(L), seen, L, noise)
     amp = k[..., :2].square().sum(-1).mean(-1).sqrt().clamp(min=AMP_LEAST)
     turn = _canonical(k[..., :2], amp)
 
@@ -187,7 +205,7 @@ def _known(
     rod = robot.rod
     pull, moment = torch.zeros(B, STATIONS, dtype=DTYPE), torch.zeros(B, STATIONS, 3, dtype=DTYPE)
     if tension is not None and len(robot.tendons):
-        tension = tension.nan_to_num(0.0)
+        tension = tension.nan_to_num(0.0).clamp(min=0)
         on = torch.stack([stations <= t.ends_at * (1 + 1e-9) for t in robot.tendons.tendons]).to(DTYPE)
         r = torch.stack([t.offset_at(stations)[0] for t in robot.tendons.tendons])
         pull = tension @ on / rod.force_scale

@@ -12,6 +12,7 @@ Per load, from the features of learned.features, in the canonical frame:
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +25,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from .. import kernel
-from ..util.errors import InputError
+from ..util.errors import InputError, shown
 from ..util.files import reading
 
 SCHEMA = 1  # of the card
@@ -33,6 +34,8 @@ ETA_LARGEST = 6.0
 INPUT_LARGEST = 8.0  # standard deviations: beyond them the network has seen nothing
 LOG_DIAGONAL = 6.0
 SPREAD_WIDTH = 64
+CLOSED = ("tendons", "amp", "markers_seen")  # ranges of a card with both limits; others may be open
+SIZES = ("inputs", "count", "width", "depth")
 
 
 @dataclass(frozen=True)
@@ -139,9 +142,50 @@ def save_checkpoint(path: Path, network: Network, card: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(state, path)
     path.chmod(0o644)  # safetensors leaves it to its owner alone, and an installed package is read by all
-    sizes = {key: getattr(network, key) for key in ("inputs", "count", "width", "depth")}
+    sizes = {key: getattr(network, key) for key in SIZES}
     full = {"schema": SCHEMA, "name": path.stem, **card, "network": sizes, "sha256": digest(path)}
     path.with_suffix(".json").write_text(json.dumps(full, indent=1) + "\n", encoding="utf-8")
+
+
+def numbers_in(inputs: int, count: int, width: int, depth: int) -> int:
+    """How many numbers a Network of these sizes holds, mean and std of its inputs included."""
+    n = PER_LOAD * count
+    body = (inputs + 1) * width + (depth - 1) * (width + 1) * width
+    return 2 * inputs + body + (width + 1) * n + (width + 1) * SPREAD_WIDTH + (SPREAD_WIDTH + 1) * (n * (n + 1) // 2)
+
+
+def _check_card(card: dict[str, Any]) -> None:
+    """Every entry of a card that the library reads, by its type. Errors: ValueError, KeyError."""
+
+    def of(name: str, value: object, kind: type | tuple[type, ...], least: float = -math.inf) -> None:
+        flag = isinstance(value, bool) and kind is not bool
+        small = isinstance(value, int | float) and not value >= least
+        if not isinstance(value, kind) or flag or small:
+            raise ValueError(f"its card has {shown(value)} for {name}")
+
+    sizes = card["network"]
+    of("network", sizes, dict)
+    for key in SIZES:
+        of(f"network.{key}", sizes[key], int, least=1)
+    kinds = {"name": str, "contacts": int, "load_priors": list, "active": bool, "tendons": list, "predicted_spread": bool}
+    for key, kind in kinds.items():
+        if key in card:
+            of(key, card[key], kind)
+    for prior in card.get("load_priors", []):
+        of("load_priors", prior, str)
+    ranges = {"tendons": card.get("tendons", [0, 0]), **_table(card.get("range", {}))}
+    for key, limits in ranges.items():
+        of(key, limits, list)
+        if len(limits) != 2:
+            raise ValueError(f"its card has {shown(limits)} for {key}, not two limits")
+        for limit in limits:
+            of(key, limit, (int, float) if key in CLOSED else (int, float, type(None)))
+
+
+def _table(value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"its card has {shown(value)} for range")
+    return value
 
 
 def load_checkpoint(path: Path) -> tuple[Network, dict[str, Any]]:
@@ -160,12 +204,26 @@ def load_checkpoint(path: Path) -> tuple[Network, dict[str, Any]]:
             raise InputError(f"{path}: its card has schema {card['schema']}, this version reads {SCHEMA}; train it again")
         if card["sha256"] != digest(path):
             raise InputError(f"{path}: is not the file that its card describes; fetch or train it again")
-        sizes = {key: int(card["network"][key]) for key in ("inputs", "count", "width", "depth")}
+        _check_card(card)
+        sizes = {key: card["network"][key] for key in SIZES}
+        least = 4 * numbers_in(**sizes)
+        if least > path.stat().st_size:  # before it takes memory for a network that is not there
+            raise ValueError(f"its card tells of a network of {least} bytes, and the file has {path.stat().st_size}")
         network = Network(**sizes)
         network.load_state_dict(load_file(path))
     except InputError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError, SafetensorError) as error:
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        MemoryError,
+        RuntimeError,
+        OSError,
+        SafetensorError,
+    ) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: is not a checkpoint of torchrod ({reason}); train one with training.train") from None
     return network.double().eval().requires_grad_(False), card

@@ -71,6 +71,11 @@ def total(loads: tuple[Load, ...], s: ArcLength, inside: ArcLength) -> LoadInteg
     return result
 
 
+def _check_length(length: float) -> None:
+    if not (math.isfinite(length) and length > 0):
+        raise ValueError(f"length is {length} m; it must be positive and finite")
+
+
 def _normal_to_rod(f: Float[Tensor, "... 2"]) -> Vector:
     """(f_x, f_y, 0): the paper's loads are normal to the rod (9)."""
     return torch.cat([f, torch.zeros_like(f[..., :1])], -1)
@@ -161,6 +166,11 @@ class PointWrenches(Float64):
     s: Float[Tensor, " K"]
     frame: str = "base"
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.frame not in ("base", "local"):
+            raise ValueError(f'frame is {self.frame!r}; it must be "base" or "local"')
+
     def integrals(self, s: ArcLength, inside: ArcLength) -> LoadIntegrals:
         """Steps: of what lies before s for a local wrench, of what lies beyond s for one in the base frame."""
         force, moment = _per_stage(self.force, 2), _per_stage(self.moment, 2)
@@ -188,6 +198,10 @@ class FourierLoads(Float64):
     cosine: Float[Tensor, "... 2 K1"]
     sine: Float[Tensor, "... 2 K"]
     length: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_length(self.length)
 
     def _waves(self, s: ArcLength) -> tuple[Tensor, Tensor, Tensor]:
         w = 2 * math.pi / self.length * torch.arange(1, self.sine.shape[-1] + 1, dtype=s.dtype)
@@ -223,6 +237,10 @@ class PolynomialLoads(Float64):
 
     coefficients: Float[Tensor, "... 2 K"]
     length: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check_length(self.length)
 
     def _powers(self, s: ArcLength, shift: int) -> Tensor:
         return (s.unsqueeze(-1) / self.length) ** (torch.arange(self.coefficients.shape[-1], dtype=s.dtype) + shift)

@@ -15,12 +15,20 @@ from .tendons import Tendons
 
 @dataclass(frozen=True)
 class Robot(Float64):
-    """A rod with tendons in a gravity field. gravity: (3,) or (B, 3), m/s^2, base frame."""
+    """A rod with tendons in a gravity field. gravity: (3,) or (B, 3), m/s^2, base frame. Errors: ValueError for another shape."""
 
     rod: Rod
     tendons: Tendons = field(default_factory=Tendons)
     gravity: Vector = field(default_factory=lambda: torch.zeros(3, dtype=DTYPE))
     name: str = "rod"
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.gravity.ndim not in (1, 2) or self.gravity.shape[-1] != 3:
+            raise ValueError(f"gravity has shape {tuple(self.gravity.shape)}; it must be (3,) or (samples, 3), in m/s^2")
+        beyond = [t.ends_at for t in self.tendons.tendons if t.ends_at > self.rod.length * (1 + 1e-6)]
+        if beyond:
+            raise ValueError(f"a tendon ends at {beyond[0]:g} m, beyond the rod's length of {self.rod.length:g} m")
 
     @property
     def weight(self) -> Vector:

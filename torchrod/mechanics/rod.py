@@ -7,8 +7,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..util.precision import DTYPE, Float64
+from ..util.precision import DTYPE, Float64, plain
 from .lie import Matrix
+
+SYMMETRIC = 1e-6  # relative: what the numbers of a file may be off
+
+
+def check_stiffness(name: str, K: Tensor, unit: str) -> None:
+    """Refuse what is not a symmetric positive definite 3 x 3 matrix. Errors: ValueError."""
+    if K.shape != (3, 3):
+        raise ValueError(f"{name} has shape {tuple(K.shape)}; it must be a 3 x 3 matrix, in {unit}")
+    if not plain(K):
+        return
+    if not bool(torch.isfinite(K).all()):
+        raise ValueError(f"{name} must be finite, in {unit}")
+    if not torch.allclose(K, K.mT, rtol=SYMMETRIC, atol=0) or int(torch.linalg.cholesky_ex(K.detach()).info):
+        raise ValueError(f"{name} must be symmetric positive definite, in {unit}")
 
 
 @dataclass(frozen=True)
@@ -18,7 +32,7 @@ class Rod(Float64):
     Constitutive law in the section frame: n = K_se (v - e3), m = K_bt (u - u*).
     length: L (m). K_se: shear and axial stiffness (3, 3), N. K_bt: bending and torsion stiffness (3, 3), N m^2.
     mass_per_length: kg/m. reference_curvature: rows [s, u*_x, u*_y, u*_z] (m, 1/m), linear in between; one row is constant.
-    One rod serves the whole batch. Source: Rucker & Webster 2011, eq. (4)-(6).
+    One rod serves the whole batch. Errors: ValueError for what is no rod. Source: Rucker & Webster 2011, eq. (4)-(6).
     """
 
     length: float
@@ -26,6 +40,23 @@ class Rod(Float64):
     K_bt: Float[Tensor, "3 3"]
     mass_per_length: Float[Tensor, ""]
     reference_curvature: Float[Tensor, "rows 4"]
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not (math.isfinite(self.length) and self.length > 0):
+            raise ValueError(f"the rod's length is {self.length} m; it must be positive and finite")
+        for name, unit in (("K_se", "N"), ("K_bt", "N m^2")):
+            check_stiffness(name, getattr(self, name), unit)
+        mass, rows = self.mass_per_length, self.reference_curvature
+        if mass.ndim or (plain(mass) and not (math.isfinite(float(mass)) and float(mass) >= 0)):
+            said = f"of shape {tuple(mass.shape)}" if mass.ndim else f"{float(mass)} kg/m"
+            raise ValueError(f"mass_per_length is {said}; it must be one finite number, at least 0")
+        if rows.ndim != 2 or rows.shape[1] != 4 or not len(rows):
+            raise ValueError(f"reference_curvature has shape {tuple(rows.shape)}; it must be rows of [s, ux, uy, uz]")
+        if plain(rows) and not bool(torch.isfinite(rows).all()):
+            raise ValueError("reference_curvature must be finite, in m and 1/m")
+        if plain(rows) and bool((rows[:, 0].diff() < 0).any()):
+            raise ValueError("reference_curvature: s must increase from row to row")
 
     @classmethod
     def circular(
@@ -38,6 +69,9 @@ class Rod(Float64):
         reference_curvature: Float[Tensor, "rows 4"] | None = None,
     ) -> "Rod":
         """A solid circular section: K_se = diag(GA, GA, EA), K_bt = diag(EI, EI, 2GI). SI units; no shear correction factor."""
+        for name, value in (("diameter", diameter), ("youngs_modulus", youngs_modulus), ("shear_modulus", shear_modulus)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}; it must be positive and finite")
         area = math.pi * diameter**2 / 4
         inertia = math.pi * diameter**4 / 64
         K_se = torch.tensor([shear_modulus * area, shear_modulus * area, youngs_modulus * area], dtype=DTYPE)

@@ -1,6 +1,8 @@
 """Tendons: where they run in the section, where they end, and the strains they leave for the rod to carry."""
 
+import math
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -24,12 +26,22 @@ class Tendon:
 
     routing: rows [s, x, y] (m): its offset from the centre line in the section frame; one row is a straight tendon, more rows
     are joined by a C2 cubic spline in s. ends_at: arc length (m) at which it is fixed to the rod.
-    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`).
+    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`). Errors: ValueError for what is no tendon.
     """
 
     routing: tuple[tuple[float, float, float], ...]
     ends_at: float
     tension_offset: float = 0.0
+
+    def __post_init__(self):
+        if not self.routing or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in self.routing):
+            raise ValueError("a tendon's routing must be rows of three finite numbers [s, x, y], in m")
+        if any(b[0] <= a[0] for a, b in pairwise(self.routing)):
+            raise ValueError("a tendon's routing: s must increase from row to row")
+        if not (math.isfinite(self.ends_at) and self.ends_at > 0):
+            raise ValueError(f"a tendon ends at {self.ends_at} m; it must be positive and finite")
+        if not math.isfinite(self.tension_offset):
+            raise ValueError(f"a tendon's tension_offset is {self.tension_offset} N; it must be finite")
 
     @classmethod
     def straight(cls, x: float, y: float, ends_at: float, tension_offset: float = 0.0) -> "Tendon":

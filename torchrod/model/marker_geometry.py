@@ -15,6 +15,7 @@ SHORT = 0.01  # of the rod: where all markers lie nearer to its base, arc length
 OFF = 0.1  # rod lengths: a marker that is so much farther from the origin than along the rod is in another frame
 NEAR_BASE = 0.3  # of the length: the markers that say which way the rod leaves the base
 AXES = [(sign, axis, f"{'+' if sign > 0 else '-'}{'xyz'[axis]}") for axis in range(3) for sign in (1.0, -1.0)]
+STRAIGHT = 0.85  # chord over arc of the rod up to a marker: one bent more may have turned by 60 degrees since the base
 ASIDE = 0.87  # cosine of 30 degrees: so near an axis, the shape follows that one
 
 
@@ -34,6 +35,11 @@ def _scale(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float) -> fl
     along = s.diff()
     steps = (z.diff(dim=0).norm(dim=-1) / along)[along > 0]
     return float(steps.median()) if len(steps) else float(z.abs().max()) / length
+
+
+def at_origin(markers: Markers) -> Bool[Tensor, "B P"]:
+    """Markers away from the base at exactly (0, 0, 0): what some programs write for one that they have not seen."""
+    return (markers.positions == 0).all(-1) & (markers.s > 0)
 
 
 def too_far(markers: Markers, length: float) -> str:
@@ -65,6 +71,10 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
         return "No marker was seen: every position is empty or NaN."
     if len(s) == 1:
         return "Only one marker was seen: a contact needs at least two."
+    zero = (at_origin(markers)[sample]).nonzero().flatten()
+    if len(zero):
+        places = _named(zero.tolist(), markers.s)
+        return f"{places} at exactly (0, 0, 0), which some programs write for a missing one: leave the cells empty, or NaN."
     slack = OFF * length if markers.offsets is None else OFF * length + float(markers.offsets.norm(dim=-1).max())
     size, scale = float(z.abs().max()), _scale(z, s, length)
     spans, along = float(z.diff(dim=0).norm(dim=-1).sum()), float(s[-1] - s[0])
@@ -72,12 +82,17 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
         return f"Positions reach {size:.3g} m on a rod of {length:g} m: {unit_hint(scale)}."
     if along > 0 and scale > min(UNITS) / ALIKE:
         return f"Markers {spans:.3g} m apart in space lie {along:.2g} m apart along the rod: give the arc lengths s in metres."
-    if along > 0 and scale < SMALL and spans + slack < along:
+    if along > 0 and scale < SMALL and spans + slack < along and any(1 / ALIKE < scale * unit < ALIKE for unit in UNITS):
         return (
             f"Markers {along:.3g} m apart along the rod lie {spans:.2g} m apart in space: "
             "give positions in metres, and check the arc lengths s."
         )
     return _strayed(z, seen, markers.s, length) or _turned(z, s, length, slack)
+
+
+def _named(which: list[int], s: Float[Tensor, " P"]) -> str:
+    names = ", ".join(f"{i + 1} (s = {1e3 * float(s[i]):.4g} mm)" for i in which)
+    return f"Marker{'s' * (len(which) > 1)} {names}"
 
 
 def _strayed(z: Float[Tensor, "p 3"], seen: Bool[Tensor, " P"], s: Float[Tensor, " P"], length: float) -> str:
@@ -87,9 +102,8 @@ def _strayed(z: Float[Tensor, "p 3"], seen: Bool[Tensor, " P"], s: Float[Tensor,
     if not 0 < 2 * len(stray) < len(z):
         return ""
     which = seen.nonzero().flatten()[stray].tolist()
-    names = ", ".join(f"{i + 1} (s = {1e3 * float(s[i]):.4g} mm)" for i in which)
     return (
-        f"Marker{'s' * (len(which) > 1)} {names}: up to {float(off.max()):.3g} m from the others, on a rod of {length:g} m; "
+        f"{_named(which, s)}: up to {float(off.max()):.3g} m from the others, on a rod of {length:g} m; "
         "leave the cells empty, or try --robust."
     )
 
@@ -108,8 +122,10 @@ def _turned(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float, slac
 
 
 def _leaves(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float) -> str:
-    """The axis along which the markers nearest the base leave it, where it is not +z."""
-    near = z[(s <= NEAR_BASE * length) & (s > 0)] if bool(((s <= NEAR_BASE * length) & (s > 0)).any()) else z[:1]
+    """The axis along which the markers nearest the base leave it, where it is not +z; nothing where the rod has turned by then."""
+    near = z[(s <= NEAR_BASE * length) & (s > 0) & (z.norm(dim=-1) > STRAIGHT * s)]
+    if not len(near):
+        return ""
     way = near.sum(0)
     if not float(way.norm()) > 0 or not math.isfinite(float(way.norm())):
         return ""

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 
@@ -20,12 +21,15 @@ from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.lie import move, rotate
 from ..mechanics.robot import Robot
 from ..mechanics.statics import shape_from_base
+from ..util.errors import InputError
 from ..util.files import put
 from ..util.precision import DTYPE
 
 INK, LOAD, MARKER, TENDON, TRUTH = "#1b2a41", "#c8102e", "#0a7f8c", "#9a9a9a", "#b5b5b5"
 ARROW = 0.28  # the largest net force is drawn this long, in rod lengths
 ENVELOPE = 0.12  # and the densest load this high
+MOST_NEAR = 2000  # points of the line that are added where the loads are
+MOST_NAMED = 12  # loads: the largest have their force and place written beside them
 ROW_FROM, ROW = 0.8, 0.9  # of the height of |f|: what the curves may take, and where the contacts' locations stand
 
 
@@ -45,10 +49,15 @@ def _scene(robot: Robot, fit: FittedRod, tension: Tensor | None) -> _Scene:
     L = robot.rod.length
     loads = fit.loads(L)
     near = (fit.location.unsqueeze(-1) + fit.width.unsqueeze(-1) * torch.linspace(-3, 3, 25, dtype=DTYPE)).flatten().clamp(0, L)
+    near = near[:: math.ceil(len(near) / MOST_NEAR) or 1]
     s = torch.cat([torch.linspace(0, L, 121, dtype=DTYPE), near, fit.location]).sort().values
     tension = None if tension is None else tension.unsqueeze(0)
     shape = shape_from_base(robot, loads, fit.base_wrench.unsqueeze(0), tension, s, DEFAULT_STEPS, differentiable=False)
     p, q = shape.p[0], shape.q[0]
+    if not bool(torch.isfinite(p).all()):
+        raise InputError(
+            "the base wrench of the result leaves this robot no shape; give the robot that was estimated, as it was then"
+        )
 
     def measured(x: Tensor) -> Tensor:
         return x if fit.registration is None else move(fit.registration, x)
@@ -100,10 +109,9 @@ def _look_across(axes: Axes3D, vectors: Float[Tensor, "n 3"]) -> None:
 
 
 def _arrows(axes: Axes3D, scene: _Scene, colour: str, width: float, label: str, order: int) -> None:
-    for k, (head, tail) in enumerate(zip(scene.points, scene.tails, strict=True)):
-        (x, y, z), way = tail.tolist(), (head - tail).tolist()
-        name = label if k == 0 else None
-        axes.quiver(x, y, z, *way, color=colour, linewidth=width, arrow_length_ratio=0.18, label=name, zorder=order)
+    if len(scene.points):
+        look = {"color": colour, "linewidth": width, "arrow_length_ratio": 0.18, "label": label, "zorder": order}
+        axes.quiver(*scene.tails.T.numpy(), *(scene.points - scene.tails).T.numpy(), **look)
 
 
 def _label(fit: FittedRod, k: int) -> str:
@@ -136,8 +144,8 @@ def draw_on(
     if scene.loaded.any():
         envelope = torch.where(scene.loaded.unsqueeze(-1), scene.envelope, torch.nan)  # no line from one load to the next
         axes.plot(*envelope.T.numpy(), color=LOAD, linewidth=1, zorder=3, label="load per length")
-        for i in scene.loaded.nonzero().flatten().tolist():
-            axes.plot(*torch.stack([scene.envelope[i], scene.line[i]]).T.numpy(), color=LOAD, linewidth=0.5, alpha=0.5, zorder=3)
+        rays = torch.stack([scene.envelope, scene.line], 1)[scene.loaded].numpy()
+        axes.add_collection3d(Line3DCollection(rays, colors=LOAD, linewidths=0.5, alpha=0.5, zorder=3))
     vectors, everything = scene.points - scene.tails, torch.cat([scene.line, seen, scene.tails, scene.envelope])
     if truth is not None:
         true_scene = _scene(robot, truth, tension)
@@ -146,7 +154,9 @@ def draw_on(
         both = [(_label(truth, k), _label(fit, k)) for k in range(min(len(truth.force), len(fit.force)))]
         axes.set_title("\n".join(f"true {a}, estimated {b}" for a, b in both), fontsize=12)
     else:
-        for k, (x, y, z) in enumerate(scene.tails.tolist()):
+        pushes = (scene.points - scene.tails).norm(dim=-1)
+        for k in sorted(pushes.argsort(descending=True)[:MOST_NAMED].tolist()):
+            x, y, z = scene.tails[k].tolist()
             axes.text(x, y, z, _label(fit, k), color=LOAD, fontsize=11, fontweight="bold", ha="center", va="bottom")
     _arrows(axes, scene, LOAD, 2.2, "net force", 5)
     axes.scatter(*scene.line[0].tolist(), color=INK, marker="s", s=60, zorder=6, label="clamp")

@@ -30,9 +30,16 @@ def reason(error: OSError, remedy: str, denied: str) -> str:
     return f"({error.strerror or error}); {given}"
 
 
+def _named(path: str | Path, done: str) -> None:
+    """Refuse what no file can be called."""
+    if "\0" in str(path):
+        raise InputError(f"{path}: cannot be {done} (no file has a NUL in its name); check the path")
+
+
 @contextmanager
 def reading(path: str | Path) -> Iterator[None]:
     """Within it, an OSError says that this file cannot be read. Errors: InputError."""
+    _named(path, "read")
     try:
         yield
     except OSError as error:
@@ -42,6 +49,7 @@ def reading(path: str | Path) -> Iterator[None]:
 @contextmanager
 def writing(path: str | Path) -> Iterator[None]:
     """Within it, an OSError says that this file cannot be written. Errors: InputError."""
+    _named(path, "written")
     try:
         yield
     except OSError as error:

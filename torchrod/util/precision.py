@@ -17,6 +17,11 @@ def as_float64(x: Tensor | None) -> Tensor | None:
     return None if x is None else x.to(DTYPE)
 
 
+def plain(x: Tensor) -> bool:
+    """Whether the numbers of a tensor can be looked at: not within torch.func's transforms, where they stand for others."""
+    return not torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 class Float64:
     """A frozen dataclass whose tensors of numbers are made float64; flags stay flags. Errors: ValueError for complex numbers."""
 
