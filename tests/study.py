@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tests.problems import posed
 from tests.robots import steel_rod
-from torchrod import Estimate, GaussianCoordinates, Markers, Model, PointForces, Robot, estimate, solve_shape
+from torchrod import Estimate, GaussianCoordinates, PointForces, Problem, Robot, estimate, solve_shape
 
 
 @dataclass(frozen=True)
@@ -18,11 +19,16 @@ class Study:
     force: Tensor
     location: Tensor
 
-    def estimate(self, noise: float, prior: str, sigma: float, seed: int = 1) -> Estimate:
+    def problem(self, noise: float, prior: str, sigma: float, seed: int = 1) -> Problem:
+        """With that much noise added, and sigma told."""
         generator = torch.Generator().manual_seed(seed)
         positions = self.positions + noise * torch.randn(self.positions.shape, generator=generator)
-        model = Model(self.robot, GaussianCoordinates(1, 0.4, self.robot.rod.force_scale, prior))
-        return estimate(model, Markers(self.s, positions), sigma)
+        loads = GaussianCoordinates(1, 0.4, self.robot.rod.force_scale, prior)
+        return posed(self.s, positions, sigma, self.robot, loads)
+
+    def estimate(self, noise: float, prior: str, sigma: float, seed: int = 1) -> Estimate:
+        """The fit to it."""
+        return estimate(self.problem(noise, prior, sigma, seed))
 
 
 def study1(count: int = 100, seed: int = 0) -> Study:
