@@ -87,14 +87,14 @@ install_import_hook("torchrod", "beartype.beartype")
 import torch
 torch.set_default_dtype(torch.float64)
 from tests.robots import T, busy_robot
-from torchrod import GaussianCoordinates, Markers, Model, PointForces, Settings, estimate, solve_shape
+from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Registration, Settings, Unknowns, estimate, solve_shape
 robot, s, tension = busy_robot(), torch.linspace(0.1, 0.4, 4), T([[3.0, 2.0], [1.0, 2.0]])
 load = PointForces(T([[[0.2, 0.1, 0.0]], [[0.3, 0.0, 0.0]]]), T([[0.2], [0.3]]))
 shape = solve_shape(robot, (load,), tension, s, 2, 4)
-model = Model(robot, GaussianCoordinates(1, 0.4, 1.0), registration=True, steps=4)
-markers = Markers(s, shape.p, 0.01 * torch.ones(4, 3), tension)
-fit = estimate(model, markers, 1e-3, Settings(max_iterations=2))
-print(fit.magnitude_std, fit.rms_residual, fit.fit(0).loads(0.4))
+markers = Markers(s, shape.p, 1e-3, 0.01 * torch.ones(4, 3))
+unknowns = Unknowns(GaussianCoordinates(1, 0.4, 1.0), registration=Registration())
+fit = estimate(Problem(robot, unknowns, [markers], tension, steps=4), Settings(max_iterations=2))
+print(fit.magnitude_std, fit.rms_residual, fit.fitted_rod(0).loads(0.4))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]

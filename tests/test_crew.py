@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.robots import T, steel_rod
+from tests.problems import posed
+from tests.robots import T
 from tests.test_fast import needs_compiler
-from torchrod import GaussianCoordinates, Markers, Model, kernel
-from torchrod.estimation.evaluator import Prepared
+from torchrod import GaussianCoordinates, kernel
+from torchrod.estimation.evaluator import KernelEvaluator
 
 BEGIN = """
 import os, threading
@@ -28,10 +29,10 @@ torch.set_num_threads(3)
 
 def caller(samples: int):
     """The normal equations of so many samples: the kernel, and nothing of torch that has threads of its own."""
-    model, markers = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0)), Markers(T([0.1, 0.4]), torch.zeros(samples, 2, 3))
-    x = torch.randn(samples, model.size, generator=torch.Generator().manual_seed(0)) * 0.3
-    prepared = Prepared(model, markers, model.weights(markers, 1e-3))
-    return lambda: prepared.sums(x)
+    problem = posed(T([0.1, 0.4]), torch.zeros(samples, 2, 3), loads=GaussianCoordinates(1, 0.4, 1.0))
+    x = torch.randn(samples, problem.size, generator=torch.Generator().manual_seed(0)) * 0.3
+    evaluate = KernelEvaluator(problem)
+    return lambda: evaluate.sums(x)
 
 
 def same(a: kernel.Sums, b: kernel.Sums) -> bool:

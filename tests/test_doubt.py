@@ -6,24 +6,24 @@ import math
 import pytest
 import torch
 
+from tests.problems import posed
 from tests.robots import T, steel_rod
 from torchrod import (
     GaussianCoordinates,
-    Markers,
-    Model,
     PointForces,
     Robot,
     Settings,
     Shapes,
     Tendon,
     Tendons,
+    Unknowns,
     estimate,
     estimate_noise,
     estimate_noise_among,
     solve_shape,
     write_shapes,
 )
-from torchrod.analysis.noise import white
+from torchrod.analysis.noise import white, with_noise
 from torchrod.cli import main
 
 B, S = 200, torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
@@ -50,9 +50,9 @@ def with_outliers(p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return p + 0.05 * off * bad.unsqueeze(-1), bad
 
 
-def one_contact() -> Model:
-    robot = steel_rod()
-    return Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale))
+def contacts(most: int) -> list[Unknowns]:
+    """None, one, ... of them."""
+    return [Unknowns(GaussianCoordinates(k, 0.4, steel_rod().rod.force_scale)) for k in range(most + 1)]
 
 
 def errors(fit, size, at) -> tuple[float, float]:
@@ -64,8 +64,8 @@ def test_outliers_are_named_and_cost_little():
     """With 10 % of the markers off by 50 mm, errors within 1.5 of clean."""
     p, size, at = drawn()
     dirty, bad = with_outliers(p)
-    clean = estimate(one_contact(), Markers(S, p), 1e-3)
-    robust = estimate(one_contact(), Markers(S, dirty), 1e-3, Settings(robust=10.0))
+    clean = estimate(posed(S, p))
+    robust = estimate(posed(S, dirty), Settings(robust=10.0))
     assert robust.accepted.double().mean() > 0.98
     assert bool((robust.outlier | ~bad).all())
     assert float((robust.outlier & ~bad).double().mean()) < 0.004
@@ -80,7 +80,7 @@ def test_outliers_are_named_and_cost_little():
 def test_a_fit_that_leaves_most_markers_aside_is_not_accepted():
     p, _, _ = drawn()
     scattered = p[:20] + 0.05 * torch.randn(20, 20, 3, generator=torch.Generator().manual_seed(1))
-    fit = estimate(one_contact(), Markers(S, scattered), 1e-3, Settings(robust=10.0, restarts=()))
+    fit = estimate(posed(S, scattered), Settings(robust=10.0, restarts=()))
     assert not fit.accepted.any()
 
 
@@ -88,11 +88,12 @@ def test_a_fit_that_leaves_most_markers_aside_is_not_accepted():
 def test_the_noise_is_found_and_what_it_costs_is_counted():
     for sigma in (2e-4, 4e-3):
         p, size, _ = drawn(sigma)
-        noise, known = estimate_noise(one_contact(), Markers(S, p))
+        problem = posed(S, p)
+        noise, known = estimate_noise(problem)
         assert abs(float(noise.sigma.mean()) / sigma - 1) < 0.03
         assert abs(float(noise.sigma.std() / noise.std.mean()) - 1) < 0.2
-        fit = estimate(one_contact(), known, sigma)
-        told, plain = noise.judged(fit), estimate(one_contact(), Markers(S, p), sigma)
+        fit = estimate(with_noise(problem, known))
+        told, plain = noise.judged(fit), estimate(posed(S, p, sigma))
         assert told.accepted.double().mean() > 0.98
         assert float((told.magnitude_std / fit.magnitude_std).min()) > 1.02
         assert abs(float((told.force - plain.force).norm(dim=-1).median())) < 0.2 * float(plain.magnitude_std.median())
@@ -103,29 +104,26 @@ def test_the_noise_is_found_and_what_it_costs_is_counted():
 @pytest.mark.many_fits
 def test_the_noise_is_found_without_knowing_the_number_of_loads():
     """The richest fit does not settle in 3 % of these cases (9 % without a load): alone its noise is up to 14 times too large."""
-    robot, g = steel_rod(), torch.Generator().manual_seed(7)
-    models = [Model(robot, GaussianCoordinates(k, 0.4, robot.rod.force_scale)) for k in range(4)]
-    for markers in (
-        Markers(S, drawn(2e-4)[0]),
-        Markers(S, T([0.0, 0.0, 1.0]) * S[:, None] + 2e-4 * torch.randn(B, 20, 3, generator=g)),
+    g, candidates = torch.Generator().manual_seed(7), contacts(3)
+    for positions in (
+        drawn(2e-4)[0],
+        T([0.0, 0.0, 1.0]) * S[:, None] + 2e-4 * torch.randn(B, 20, 3, generator=g),
     ):
-        richest, _ = estimate_noise(models[-1], markers)
-        noise, known = estimate_noise_among(models, markers)
+        problem = posed(S, positions)
+        richest, _ = estimate_noise(problem.of(candidates[-1]))
+        noise, known = estimate_noise_among(problem, candidates)
         assert float(richest.sigma.max()) > 2 * 2e-4
         assert float(noise.sigma.max()) < 1.6 * 2e-4
         assert float(noise.sigma.min()) > 0.5 * 2e-4
         assert abs(float(noise.sigma.mean()) / 2e-4 - 1) < 0.03
-        assert known.sigma is not None
-        assert torch.equal(known.sigma, noise.sigma)
+        assert torch.equal(known, noise.sigma)
 
 
 @pytest.mark.many_fits
 def test_outliers_of_a_model_with_too_few_loads_do_not_tell_the_noise():
     """A robust fit without a load calls most markers outliers; what those leave is little, and no noise."""
     p = drawn()[0][:20]
-    robot = steel_rod()
-    models = [Model(robot, GaussianCoordinates(k, 0.4, robot.rod.force_scale)) for k in range(3)]
-    noise, _ = estimate_noise_among(models, Markers(S, p), Settings(robust=10.0))
+    noise, _ = estimate_noise_among(posed(S, p), contacts(2), Settings(robust=10.0))
     assert noise.freedom.min() > 40
     assert 0.9 < (noise.sigma / 1e-3).mean() < 1.1 and noise.sigma.max() < 1.5e-3
 
@@ -135,8 +133,8 @@ def test_the_noise_of_a_sample_does_not_depend_on_its_batch():
     """Rounds go on for the sake of others; a sample that has settled stays."""
     p = drawn()[0][:8]
     p[1:] += 4e-3 * torch.randn(7, 20, 3, generator=torch.Generator().manual_seed(3))
-    together, _ = estimate_noise(one_contact(), Markers(S, p))
-    alone = [estimate_noise(one_contact(), Markers(S, p[i : i + 1]))[0] for i in range(8)]
+    together, _ = estimate_noise(posed(S, p))
+    alone = [estimate_noise(posed(S, p[i : i + 1]))[0] for i in range(8)]
     assert torch.allclose(together.sigma, torch.cat([one.sigma for one in alone]), rtol=1e-6)
 
 
@@ -148,7 +146,7 @@ def test_few_markers_tell_the_noise_by_the_richest_model_they_can(tmp_path, caps
     )
     few = drawn()[0][:2, [5, 11, 17]].clone()
     few[1, 1:] = torch.nan
-    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(S[[5, 11, 17]], few), ["three", "one"]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(S[[5, 11, 17]], few, ["three", "one"]))
     command = ["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), "--noise", "auto", "--contacts", "auto"]
     assert main(command) == 0
     said = capsys.readouterr().out
@@ -162,10 +160,11 @@ def test_a_smooth_residual_is_not_noise():
     """Two strong pushes fitted by one leave a residual that is alike from marker to marker; noise alone does not."""
     robot, at = steel_rod(), T([[0.12, 0.36]])
     p = solve_shape(robot, (PointForces(T([[[1.5, 0.0, 0.0], [-1.0, 0.4, 0.0]]]), at),), None, S, 1).p
-    noise, known = estimate_noise(one_contact(), Markers(S, p))
-    assert not bool(noise.judged(estimate(one_contact(), known, 1e-3)).accepted[0])
+    problem = posed(S, p)
+    noise, known = estimate_noise(problem)
+    assert not bool(noise.judged(estimate(with_noise(problem, known))).accepted[0])
     p, _, _ = drawn()
-    assert white(estimate(one_contact(), Markers(S, p), 1e-3)).double().mean() > 0.98
+    assert white(estimate(posed(S, p))).double().mean() > 0.98
 
 
 def pulled() -> Robot:
@@ -182,9 +181,9 @@ def test_tensions_move_within_their_sensors_errors():
     p = solve_shape(robot, (PointForces(force, at),), true, S, n).p
     p = p + 3e-4 * torch.randn(p.shape, generator=g)
     reading = true + 0.3 * torch.randn(n, 2, generator=g)
-    coordinates = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")
-    exact = estimate(Model(robot, coordinates), Markers(S, p, None, reading), 3e-4)
-    free = estimate(Model(robot, coordinates, tension_std=0.3), Markers(S, p, None, reading), 3e-4)
+    loads = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")
+    exact = estimate(posed(S, p, 3e-4, robot, loads, reading))
+    free = estimate(posed(S, p, 3e-4, robot, loads, reading, tension_std=0.3))
     along = force[:, 0, :2] / 0.5
     covered = []
     for fit in (exact, free):
@@ -212,7 +211,7 @@ def test_the_command_says_all_of_it(tmp_path, capsys, suffix):
     p = solve_shape(pulled(), (PointForces(force, at),), T([[4.0, 2.0]]), S, 1).p
     p = p + 2e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(2))
     p[0, 11] += T([0.0, 0.05, 0.0])
-    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(S, p, None, T([[4.0, 2.0]])), ["0"]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(S, p, ["0"], tension=T([[4.0, 2.0]])))
     out = tmp_path / f"result.{suffix}"
     command = ["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), "--robust", "--noise", "auto"]
     assert main([*command, "--tension-std", "0.2", "--load-prior", "point", "--out", str(out)]) == 0
@@ -235,7 +234,7 @@ def test_bad_values_are_refused_in_one_line(tmp_path, capsys, option, value, sai
     (tmp_path / "robot.toml").write_text(
         'name = "rod"\n[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n'
     )
-    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(S, torch.nn.functional.pad(S[:, None], (2, 0))[None]), ["0"]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(S, torch.nn.functional.pad(S[:, None], (2, 0))[None], ["0"]))
     assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), option, value]) == 2
     error = capsys.readouterr().err
     assert said in error

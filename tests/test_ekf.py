@@ -86,7 +86,25 @@ def test_a_bad_sample_is_nan_and_alone():
 
 
 def test_adapted_weights_return_to_the_truth():
-    w = torch.tensor([[4.0, 4.0, 0.0, 100.0]])
-    assert torch.equal(ekf.inflation(w, 3, torch.tensor([6.0])), torch.tensor([3.0]))
-    assert torch.equal(ekf.adapted_weights(w, 3, torch.zeros(1)), w)
-    assert torch.allclose(ekf.adapted_weights(w, 3, torch.tensor([3.0])), torch.tensor([[1.0, 1.0, 0.0, 100.0]]))
+    """R = sigma^2 (1 + promised / m) on what the m sensor rows say, not on the tip residual; with a cap of zero the true R."""
+    H, r, w, Sigma = problem()
+    w[:, 3] = 0.0
+    groups, tip, Q, x = torch.arange(Z - 6) // 2, torch.zeros(Z), torch.rand(N), torch.randn(B, N)
+    tip[-6:] = 1.0
+    prior = torch.randn(N), torch.rand(N) + 0.1
+    normal, limits = ekf.normal_equations(H, r, w, groups), ekf.Limits(step=torch.inf)
+    assert normal.seen.tolist() == [Z - 7] * B
+    promised = ekf.decrement(*ekf.information(H, r, w, x, *prior))
+    cap = torch.tensor([torch.inf, 0.5 * float(promised[1]) / (Z - 7), 0.0])
+    at = ekf.Iterate(x, Sigma, x, cap, torch.zeros(B, dtype=torch.bool))
+    after = ekf.advance(at, normal, Sigma, prior, Q, limits)
+    inflated = promised / (Z - 7) * torch.tensor([1.0, 0.5, 0.0])
+    adapted = torch.where(tip > 0, w, w / (1 + inflated).unsqueeze(-1))
+    A, g = ekf.information(H, r, adapted, x, *prior)
+    step, Sigma_next = ekf.update(ekf.predict(Sigma, Q), A, g)
+    assert torch.allclose(after.x, x + step, atol=1e-10)
+    assert torch.allclose(after.Sigma, Sigma_next, atol=1e-10)
+    settled = ekf.advance(at, normal, Sigma, prior, Q, limits._replace(settled=torch.inf))
+    assert torch.allclose(settled.cap, 0.1 * inflated)
+    moving = ekf.advance(at, normal, Sigma, prior, Q, limits._replace(settled=0.0))
+    assert torch.equal(moving.cap, cap)

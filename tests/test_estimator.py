@@ -6,18 +6,20 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
-from studies.reproduction.cases import S, study1
 
+from tests.problems import posed
 from tests.robots import T, steel_rod
+from tests.study import study1
 from torchrod import (
     FourierCoordinates,
     GaussianCoordinates,
     InputError,
-    Markers,
-    Model,
+    Origin,
     PaperCoordinates,
     PointCoordinates,
     PointForces,
+    Problem,
+    Registration,
     Settings,
     Start,
     Status,
@@ -36,7 +38,7 @@ from torchrod.estimation.solve import linearize
 def test_study_1(noise, sigma, prior, millimetres, newtons):
     """Every case converges and is accepted, within ten iterations in the mean, well within the paper's errors."""
     study = study1(100)
-    fit = study.estimate(study.noisy(noise, seed=1), sigma, prior)
+    fit = study.estimate(noise, prior, sigma)
     assert (fit.status == Status.CONVERGED).all()
     assert fit.accepted.all()
     assert fit.iterations.double().mean() <= 10
@@ -48,7 +50,7 @@ def test_study_1(noise, sigma, prior, millimetres, newtons):
 def test_the_reported_spread_is_the_observed_one():
     """Study 1 with 1 mm noise: normalized errors of location and magnitude have about unit variance."""
     study = study1(100)
-    fit = study.estimate(study.noisy(1e-3, seed=1), 1e-3, "point")
+    fit = study.estimate(1e-3, "point", 1e-3)
     location = (fit.location[:, 0] - study.location) / fit.location_std[:, 0]
     magnitude = (fit.magnitude[:, 0] - study.force.norm(dim=-1)) / fit.magnitude_std[:, 0]
     for z in (location, magnitude):
@@ -64,10 +66,10 @@ def test_the_reported_spread_is_the_observed_one():
 
 
 def test_the_interval_of_a_force_that_is_not_there_reaches_zero():
-    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    s = torch.linspace(0.02, 0.4, 20)
     straight = torch.zeros(1, 20, 3)
     straight[..., 2] = s
-    fit = estimate(Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale)), Markers(s, straight), 1e-3)
+    fit = estimate(posed(s, straight))
     assert fit.accepted[0]
     assert fit.magnitude[0, 0] < fit.magnitude_std[0, 0]
     assert fit.magnitude_interval[0, 0, 0] == 0
@@ -81,9 +83,8 @@ def test_a_samples_answer_does_not_depend_on_its_batch():
     positions[1] = torch.nan
     positions[2] = 5 * torch.randn(positions[2].shape, generator=torch.Generator().manual_seed(0))
     positions[3, 1:] = torch.nan
-    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
     limit = Settings(max_iterations=12)
-    together = estimate(model, Markers(S, positions), 1e-3, limit)
+    together = estimate(posed(study.s, positions), limit)
     assert together.status.tolist()[0] == Status.CONVERGED
     assert together.status.tolist()[1] == together.status.tolist()[3] == Status.INVALID
     assert not together.accepted[2]
@@ -92,7 +93,7 @@ def test_a_samples_answer_does_not_depend_on_its_batch():
     assert together.x[1].isnan().all()
     assert "more markers" in together.message(3)
     for i in (0, 2):
-        alone = estimate(model, Markers(S, positions[i : i + 1]), 1e-3, limit)
+        alone = estimate(posed(study.s, positions[i : i + 1]), limit)
         assert torch.allclose(together.x[i], alone.x[0], rtol=0, atol=1e-9)
         assert torch.allclose(together.covariance[i], alone.covariance[0], rtol=1e-9, atol=1e-9, equal_nan=True)
         assert together.iterations[i] == alone.iterations[0]
@@ -104,9 +105,8 @@ def test_missing_markers_are_left_out():
     gone, kept = [3, 11, 19], [i for i in range(20) if i not in (3, 11, 19)]
     positions = study.positions.clone()
     positions[:, gone] = torch.nan
-    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
-    holes = estimate(model, Markers(S, positions), 1e-3)
-    fewer = estimate(model, Markers(S[kept], study.positions[:, kept]), 1e-3)
+    holes = estimate(posed(study.s, positions))
+    fewer = estimate(posed(study.s[kept], study.positions[:, kept]))
     assert torch.allclose(holes.force, fewer.force, atol=1e-6)
     assert torch.equal(holes.dof, fewer.dof)
     assert holes.residual[:, gone].isnan().all()
@@ -115,8 +115,8 @@ def test_missing_markers_are_left_out():
 def test_a_known_location_is_kept():
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     shape = solve_shape(robot, (PointForces(T([[[0.3, 0.5, 0.0]]]), T([[0.22]])),), None, s, 1)
-    for coordinates in (GaussianCoordinates(1, 0.4, 1.0, "point", (0.22,)), PointCoordinates(1, 0.4, 1.0, (0.22,))):
-        fit = estimate(Model(robot, coordinates), Markers(s, shape.p), 1e-4)
+    for loads in (GaussianCoordinates(1, 0.4, 1.0, "point", (0.22,)), PointCoordinates(1, 0.4, 1.0, (0.22,))):
+        fit = estimate(posed(s, shape.p, 1e-4, loads=loads))
         assert fit.accepted[0]
         assert fit.location[0, 0] == 0.22
         assert torch.allclose(fit.force[0, 0], T([0.3, 0.5]), atol=1e-3)
@@ -130,13 +130,13 @@ def test_registration_recovers_a_wrong_base_frame():
     shape = solve_shape(robot, (PointForces(T([[[0.6, 0.5, 0.0]]]), T([[0.22]])),), None, s, 1)
     c, d = math.cos(math.radians(3)), math.sin(math.radians(3))
     seen = shape.p @ T([[1.0, 0, 0], [0, c, -d], [0, d, c]]).T + T([0.003, -0.004, 0.0])
-    coordinates = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")
-    fit = estimate(Model(robot, coordinates, registration=True), Markers(s, seen), 1e-4)
+    loads = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")
+    fit = estimate(posed(s, seen, 1e-4, loads=loads, registration=Registration()))
     assert fit.accepted[0]
     assert fit.registration is not None
     assert torch.allclose(fit.registration[0], T([0.003, -0.004, 0.0, math.radians(3), 0.0, 0.0]), atol=2e-3)
     assert abs(float(fit.location[0, 0]) - 0.22) < 2e-3
-    plain = estimate(Model(robot, coordinates), Markers(s, seen), 1e-4)
+    plain = estimate(posed(s, seen, 1e-4, loads=loads))
     assert not plain.accepted[0]
     assert "registration" in plain.message(0)
 
@@ -148,11 +148,11 @@ def test_markers_off_the_centre_line():
     shape = solve_shape(robot, (PointForces(T([[[0.6, 0.5, 0.0]]]), T([[0.25]])),), None, s, 1)
     offsets = T([[0.01, 0.0, 0.0], [0.0, -0.01, 0.0]]).repeat(4, 1)
     seen = shape.p + roma.quat_action(shape.q, offsets.unsqueeze(0))
-    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point"))
-    fit = estimate(model, Markers(s, seen, offsets), 1e-4)
+    loads = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")
+    fit = estimate(posed(s, seen, 1e-4, loads=loads, offsets=offsets))
     assert fit.accepted[0]
     assert abs(float(fit.location[0, 0]) - 0.25) < 1e-3
-    assert not estimate(model, Markers(s, seen), 1e-4, Settings(max_iterations=20)).accepted[0]
+    assert not estimate(posed(s, seen, 1e-4, loads=loads), Settings(max_iterations=20)).accepted[0]
 
 
 @pytest.mark.parametrize("family", ["point", "fourier"])
@@ -161,8 +161,8 @@ def test_the_other_families_fit_the_shape(family):
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     shape = solve_shape(robot, (PointForces(T([[[0.6, 0.5, 0.0], [-0.2, 0.4, 0.0]]]), T([[0.15, 0.3]])),), None, s, 1)
     scale = robot.rod.force_scale
-    coordinates = PointCoordinates(2, 0.4, scale) if family == "point" else FourierCoordinates(3, 0.4, scale)
-    fit = estimate(Model(robot, coordinates), Markers(s, shape.p), 1e-4)
+    loads = PointCoordinates(2, 0.4, scale) if family == "point" else FourierCoordinates(3, 0.4, scale)
+    fit = estimate(posed(s, shape.p, 1e-4, loads=loads))
     assert fit.status[0] == Status.CONVERGED
     assert fit.rms_residual[0] < 1e-4
     if family == "point":
@@ -175,10 +175,10 @@ def test_the_other_families_fit_the_shape(family):
 def test_the_paper_mode_runs_the_plain_recursion():
     """The paper's parameters without safeguards: as many of Study 1 converge as the paper says, and are the true load."""
     study = study1()
-    model = Model(study.robot, PaperCoordinates(1, 0.4, beta1=-0.004, beta2=0.404), scaled=False, tip_std=(2e-3, 2e-3))
     noise = 1e-3 * torch.randn(study.positions.shape, generator=torch.Generator().manual_seed(1))
     for positions, most in ((study.positions, 1e-3), (study.positions + noise, 0.02)):
-        fit = estimate(model, Markers(study.s, positions), 1e-3, paper_settings(model))
+        problem = in_paper_mode(study.s, positions, PaperCoordinates(1, 0.4, beta1=-0.004, beta2=0.404))
+        fit = estimate(problem, paper_settings(problem))
         done = fit.status == Status.CONVERGED
         assert done.double().mean() >= 0.94
         assert fit.accepted.double().mean() >= 0.94
@@ -186,20 +186,21 @@ def test_the_paper_mode_runs_the_plain_recursion():
         assert (fit.location[:, 0] - study.location)[done].abs().mean() < most
 
 
+def in_paper_mode(s, positions, loads) -> Problem:
+    return replace(posed(s, positions, loads=loads, scaled=False), tip_std=(2e-3, 2e-3))
+
+
 def test_the_paper_mode_wants_the_papers_coordinates():
     with pytest.raises(InputError, match="PaperCoordinates"):
-        paper_settings(Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0)))
+        paper_settings(posed(T([0.2, 0.4]), torch.zeros(1, 2, 3)))
 
 
 def test_a_small_step_of_the_filter_is_enough_where_that_is_wanted():
     """Settings.gain: the same recursion stops earlier, and where no step is small enough it does not stop."""
     study = study1(5)
-    model = Model(study.robot, PaperCoordinates(1, 0.4), scaled=False, tip_std=(2e-3, 2e-3))
     noise = 1e-3 * torch.randn(study.positions.shape, generator=torch.Generator().manual_seed(1))
-    fits = [
-        estimate(model, Markers(study.s, study.positions + noise), 1e-3, replace(paper_settings(model), gain=gain))
-        for gain in (1e-1, 1e-5)
-    ]
+    problem = in_paper_mode(study.s, study.positions + noise, PaperCoordinates(1, 0.4))
+    fits = [estimate(problem, replace(paper_settings(problem), gain=gain)) for gain in (1e-1, 1e-5)]
     assert (fits[0].iterations < fits[1].iterations).all()
     assert (fits[1].cost <= fits[0].cost).all()
 
@@ -208,8 +209,8 @@ def test_a_load_at_the_tip_has_its_whole_force_on_the_rod():
     """The default reports what the rod feels; (13) counts the half of the Gaussian that hangs over the tip as well."""
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     shape = solve_shape(robot, (PointForces(T([[[0.8, 0.0, 0.0]]]), T([[0.4]])),), None, s, 1)
-    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point", (0.4,)))
-    fit = estimate(model, Markers(s, shape.p), 1e-4)
+    loads = GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point", (0.4,))
+    fit = estimate(posed(s, shape.p, 1e-4, loads=loads))
     assert abs(float(fit.magnitude[0, 0]) - 0.8) < 0.03
     assert torch.allclose(fit.net_force, 2 * fit.force, rtol=1e-6)
 
@@ -224,12 +225,10 @@ def test_a_load_at_the_tip_has_its_whole_force_on_the_rod():
     ],
 )
 def test_what_does_not_fit_is_refused_with_the_remedy(change, words):
-    robot = steel_rod()
-    model = Model(robot, GaussianCoordinates(1, 0.4, 1.0))
     s = T(change.get("s", [0.2, 0.4]))
     tension = T(change["tension"]) if "tension" in change else None
     with pytest.raises(ValueError, match=words):
-        estimate(model, Markers(s, torch.zeros(1, len(s), 3), None, tension), change.get("noise", 1e-3))
+        estimate(posed(s, torch.zeros(1, len(s), 3), change.get("noise", 1e-3), tension=tension))
 
 
 @pytest.mark.many_fits
@@ -238,10 +237,10 @@ def test_a_strong_push_near_the_tip_is_found_by_a_restart():
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     force, place = T([[[4.91, 0.0, 0.0]], [[0.0, 3.99, 0.0]], [[0.5, 0.0, 0.0]]]), T([[0.379], [0.398], [0.2]])
     shape = solve_shape(robot, (PointForces(force, place),), None, s, 3, 160)
-    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "contact"))
-    once = estimate(model, Markers(s, shape.p), 1e-3, Settings(restarts=()))
+    problem = posed(s, shape.p)
+    once = estimate(problem, Settings(restarts=()))
     assert once.accepted.tolist() == [False, False, True]
-    fit = estimate(model, Markers(s, shape.p), 1e-3)
+    fit = estimate(problem)
     assert fit.accepted.all()
     assert (fit.restarts > 0).tolist() == [True, True, False]
     assert (fit.iterations >= once.iterations).all()
@@ -263,18 +262,16 @@ class Own:
 def test_coordinates_of_your_own_are_fitted_as_well():
     robot, s = steel_rod(), torch.linspace(0.04, 0.4, 10)
     p = solve_shape(robot, (PointForces(T([[[0.6, -0.2, 0.0]]]), T([[0.25]])),), None, s, 1).p
-    own, known = (estimate(Model(robot, c), Markers(s, p), 1e-4) for c in (Own(), GaussianCoordinates(1, 0.4, 1.0, "point")))  # pyright: ignore[reportArgumentType]
+    own, known = (estimate(posed(s, p, 1e-4, loads=c)) for c in (Own(), GaussianCoordinates(1, 0.4, 1.0, "point")))
     assert bool(own.accepted)
     assert torch.allclose(own.force, known.force, rtol=1e-8)
     assert torch.allclose(own.location, known.location, rtol=1e-8)
 
 
 def test_the_last_update_is_taken_and_the_cost_is_of_the_evaluation_before_it():
-    study, noise = study1(40), 1e-3
-    markers = study.noisy(noise, seed=1)
-    fit = study.estimate(markers, noise, "contact")
-    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
-    at = linearize(model, fit.x, markers, model.weights(markers, noise))
+    problem = study1(40).problem(1e-3, "contact", 1e-3)
+    fit = estimate(problem)
+    at = linearize(problem, fit.x)
     gained = fit.cost - at.cost
     assert -1e-9 < float(gained.min()) < float(gained.max()) < 1e-3, "no more than what counts as converged"
     assert float(gained.max()) > 2e-4, "and some samples had that left"
@@ -283,15 +280,13 @@ def test_the_last_update_is_taken_and_the_cost_is_of_the_evaluation_before_it():
 
 def test_a_start_is_handed_out_chunk_by_chunk(monkeypatch):
     """Known starts, of samples that the estimator takes a few at a time, and one too few."""
-    study = study1(7)
-    model = Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale))
-    markers = Markers(S, study.positions + 1e-3 * torch.randn(7, 20, 3, generator=torch.Generator().manual_seed(2)))
-    whole = estimate(model, markers, 1e-3)
-    start = Start.known(whole.x)
+    problem = study1(7).problem(1e-3, "contact", 1e-3, seed=2)
+    whole = estimate(problem)
+    start = Start.at(whole.x, Origin.OTHER_FIT)
     monkeypatch.setattr(estimator, "CHUNK", 3)
     monkeypatch.setattr(estimator, "CHUNK_TORCH", 3)
-    again = estimate(model, markers, 1e-3, start=start)
+    again = estimate(problem, start=start)
     assert (again.iterations <= 2).all() and not again.warm_started.any()
     assert torch.allclose(again.force, whole.force, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match=r"start.x has shape \(6, 10\)"):
-        estimate(model, markers, 1e-3, start=start.take(torch.arange(6)))
+        estimate(problem, start=start.take(torch.arange(6)))

@@ -7,14 +7,14 @@ import pytest
 import torch
 from studies.reproduction.cases import S, study1
 
+from tests.problems import posed
 from tests.robots import busy_robot, steel_rod
 from torchrod import (
-    Estimator,
     FourierLoads,
     GaussianCoordinates,
     GaussianLoads,
     Markers,
-    Model,
+    Origin,
     PointCoordinates,
     PointForces,
     PointWrenches,
@@ -24,6 +24,7 @@ from torchrod import (
     Start,
     Tendon,
     Tendons,
+    Tracker,
     WarmStart,
     bounds,
     cold_start,
@@ -46,23 +47,19 @@ def seen():
     return S, study.positions
 
 
-def one_contact(robot: Robot | None = None) -> Model:
-    robot = robot or steel_rod()
-    return Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale))
-
-
 def test_numbers_of_single_precision(seen):
     """As a camera gives them: markers, offsets, a start and its covariance."""
     s, p = seen
-    model, markers = one_contact(), Markers(s, p, torch.zeros(20, 3))
-    whole = estimate(model, markers, 1e-3)
-    single = Markers(*(x.float() for x in (s, p, torch.zeros(20, 3))))
-    assert all(x is not None and x.dtype == torch.float64 for x in (single.s, single.positions, single.offsets))
-    cold = cold_start(model, single, 1e-3)
-    start = Start(cold.x.float(), torch.eye(model.size).float().repeat(4, 1, 1), cold.warm)
-    for fit in (estimate(model, single, 1e-3), estimate(model, single, 1e-3, start=start)):
+    whole = estimate(posed(s, p, offsets=torch.zeros(20, 3)))
+    problem = posed(s.float(), p.float(), torch.full((4,), 1e-3).float(), offsets=torch.zeros(20, 3).float())
+    single = problem.markers
+    assert single is not None
+    assert all(x.dtype == torch.float64 for x in vars(single).values())
+    cold = cold_start(problem)
+    start = Start(cold.x.float(), cold.origin, cold.challenged, torch.eye(problem.size).float().repeat(4, 1, 1))
+    for fit in (estimate(problem), estimate(problem, start=start)):
         assert torch.allclose(fit.force, whole.force, atol=1e-4) and fit.accepted.all()
-    follow = Estimator(model, s.float(), 1e-3)
+    follow = Tracker(problem.robot, problem.unknowns, s.float(), 1e-3)
     assert torch.allclose(follow(p[0].float()).force[0], whole.force[0], atol=1e-3)
 
 
@@ -121,12 +118,10 @@ def test_bounds_and_placement_of_single_precision():
     found = []
     for to in (torch.float32, torch.float64):
         bound = bounds(robot, s.to(to), 1e-3, 0.5, places.to(to), tension.to(to), directions=2)
-        push, markers = (
-            PointForces(f([[0.5, 0.0, 0.0]]).to(to), f([0.3]).to(to)),
-            Markers(s.to(to), torch.zeros(1, 20, 3), tension=f([1.0])),
-        )
+        push = PointForces(f([[0.5, 0.0, 0.0]]).to(to), f([0.3]).to(to))
+        markers = Markers(s.to(to), torch.zeros(1, 20, 3), 1e-3)
         wrench = solve_shape(robot, (push,), f([1.0]).to(to), s.to(to), 1).base_wrench.float().to(to)
-        std = load_bound(robot, markers, force.to(to), where.to(to), wrench, 1e-3)
+        std = load_bound(robot, markers, force.to(to), where.to(to), wrench, f([1.0]).to(to))
         found.append((bound, place(robot, 4, 1e-3, 0.5, tension.to(to), directions=2), std))
     assert all(equal(single, double) for single, double in zip(found[0][:2], found[1][:2], strict=True))
     assert all(torch.equal(single, double) for single, double in zip(found[0][2], found[1][2], strict=True))
@@ -137,42 +132,43 @@ def test_bounds_and_placement_of_single_precision():
     [
         (
             {"positions": torch.zeros(4, 15, 3)},
-            r"markers.positions has shape \(4, 15, 3\); with 20 arc lengths and 4 samples .* \(4, 20, 3\)",
+            r"Markers.positions has shape \(4, 15, 3\); .* \(4, 20, 3\) with 20 arc lengths and 4 samples",
         ),
-        ({"offsets": torch.zeros(5, 3)}, r"markers.offsets has shape \(5, 3\)"),
-        ({"tension": torch.zeros(3, 2)}, r"markers.tension has shape \(3, 2\).*\(4, tendons\)"),
-        ({"sigma": torch.ones(1)}, r"markers.sigma has shape \(1,\)"),
-        ({"s": torch.zeros(1, 20)}, r"markers.s has shape"),
+        ({"offsets": torch.zeros(5, 3)}, r"Markers.offsets has shape \(5, 3\)"),
+        ({"tension": torch.zeros(3, 2)}, r"tension has shape \(3, 2\).*\(4, 2\)"),
+        ({"noise": torch.ones(1)}, r"Markers.noise has shape \(1,\)"),
+        ({"s": torch.zeros(1, 20)}, r"Markers.s has shape"),
     ],
 )
 def test_shapes_that_do_not_belong_together(seen, changed, said):
+    tendons = "tension" in changed
+    given = {"s": seen[0], "positions": seen[1], "robot": busy_robot() if tendons else steel_rod()} | changed
     with pytest.raises(ValueError, match=said):
-        estimate(one_contact(), Markers(**({"s": seen[0], "positions": seen[1]} | changed)), 1e-3)
+        estimate(posed(**given))
 
 
 def test_starts_and_gravity_that_do_not_fit(seen):
-    model, markers = one_contact(), Markers(*seen)
-    with pytest.raises(ValueError, match=r"start.x has shape \(4, 3\); these markers and this model need \(4, 10\)"):
-        estimate(model, markers, 1e-3, start=lambda *_: Start.known(torch.zeros(4, 3)))
-    tilted = one_contact(Robot(steel_rod().rod, gravity=torch.zeros(4, 3)))
+    with pytest.raises(ValueError, match=r"start.x has shape \(4, 3\); these measurements and unknowns need \(4, 10\)"):
+        estimate(posed(*seen), start=lambda _: Start.at(torch.zeros(4, 3), Origin.OTHER_FIT))
+    tilted = Robot(steel_rod().rod, gravity=torch.zeros(4, 3))
     with pytest.raises(ValueError, match="one gravity"):
-        estimate(tilted, markers, 1e-3)
+        estimate(posed(*seen, robot=tilted))
 
 
 @pytest.mark.many_fits
 def test_inference_mode(seen):
     """Tensors made in it do not tell whether they have been changed; what is kept must serve outside of it, too."""
     s, p = seen
-    whole = estimate(one_contact(), Markers(s, p), 1e-3)
+    whole = estimate(posed(s, p))
     shipped.cache_clear()
     with torch.inference_mode():
-        model, markers = one_contact(), Markers(s.clone(), p.clone())
-        start = find_warm_start(model)
+        problem = posed(s.clone(), p.clone())
+        start = find_warm_start(problem)
         assert isinstance(start, WarmStart)
-        within = [estimate(model, markers, 1e-3), estimate(model, markers, 1e-3, start=start)]
-        follow = Estimator(model, s.clone(), 1e-3)
+        within = [estimate(problem), estimate(problem, start=start)]
+        follow = Tracker(problem.robot, problem.unknowns, s.clone(), 1e-3)
         within += [follow(p[0].clone()), follow(p[0].clone())]
-    within += [estimate(model, markers, 1e-3, start=start), follow(p[0])]
+    within += [estimate(problem, start=start), follow(p[0])]
     assert not any(p.is_inference() for p in start.network.parameters()), "they are kept, and packed anew for each call if they are"
     for fit in within:
         assert not fit.force.is_inference()
@@ -183,21 +179,19 @@ def test_inference_mode(seen):
 def test_locations_may_be_a_list(seen, kind):
     robot = steel_rod()
     places: list[Any] = [[0.2], (0.2,)]
-    coordinates = [kind(1, 0.4, robot.rod.force_scale, locations=at) for at in places]
-    fits = [estimate(Model(robot, one), Markers(*seen), 1e-3) for one in coordinates]
+    families = [kind(1, 0.4, robot.rod.force_scale, locations=at) for at in places]
+    fits = [estimate(posed(*seen, loads=one)) for one in families]
     assert torch.equal(fits[0].force, fits[1].force)
 
 
 @pytest.mark.parametrize("tendons", [False, True])
 def test_no_samples_at_all(tendons):
     robot = busy_robot() if tendons else steel_rod()
-    model = one_contact(robot)
-    s = torch.linspace(0.02, 0.2, 10)
-    markers = Markers(s, torch.zeros(0, 10, 3), tension=torch.zeros(0, len(robot.tendons)) if tendons else None)
-    x = torch.zeros(0, model.size)
-    assert model.h(x, markers).shape == (0, 36)
+    tension = torch.zeros(0, len(robot.tendons)) if tendons else None
+    problem = posed(torch.linspace(0.02, 0.2, 10), torch.zeros(0, 10, 3), robot=robot, tension=tension)
+    assert problem.h(torch.zeros(0, problem.size)).shape == (0, 36)
     with pytest.raises(ValueError, match="at least one sample"):
-        estimate(model, markers, 1e-3)
+        estimate(problem)
 
 
 def test_the_tip_in_single_precision_is_the_tip():

@@ -3,37 +3,38 @@
 import roma
 import torch
 
-from tests.robots import T, busy_robot, steel_rod
-from torchrod import GaussianCoordinates, Markers, Model, PointCoordinates, forward_jacobian
+from tests.problems import posed
+from tests.robots import T, busy_robot
+from torchrod import GaussianCoordinates, PointCoordinates, Problem, Registration, forward_jacobian
 from torchrod.estimation.result import load_covariance
 from torchrod.mechanics.jacobian import pointwise_jacobian
 from torchrod.mechanics.lie import exponential, logarithm, product
 
 
-def check(model: Model, markers: Markers, x: torch.Tensor) -> None:
-    _, J = forward_jacobian(lambda x: model.h(x, markers), x)
+def check(problem: Problem, x: torch.Tensor) -> None:
+    _, J = forward_jacobian(problem.h, x)
     d = 1e-6
-    columns = [(model.h(x + d * e, markers) - model.h(x - d * e, markers)) / (2 * d) for e in torch.eye(model.size)]
+    columns = [(problem.h(x + d * e) - problem.h(x - d * e)) / (2 * d) for e in torch.eye(problem.size)]
     assert torch.isfinite(J).all()
     assert (J - torch.stack(columns, -1)).abs().max() < 1e-6 * J.abs().max()
 
 
 def test_h_has_exact_derivatives():
     robot = busy_robot()
-    markers = Markers(T([0.1, 0.23, 0.4]), torch.zeros(2, 3, 3), 0.01 * torch.eye(3), T([[3.0, 2.0], [1.0, 4.0]]))
+    s, tension, offsets = T([0.1, 0.23, 0.4]), T([[3.0, 2.0], [1.0, 4.0]]), 0.01 * torch.eye(3)
     torch.manual_seed(0)
-    for coordinates in (GaussianCoordinates(1, 0.4, robot.rod.force_scale), PointCoordinates(1, 0.4, robot.rod.force_scale)):
-        model = Model(robot, coordinates, registration=True)
-        start = model.join(coordinates.start().expand(2, -1), torch.zeros(2, 6))
-        check(model, markers, start + 0.3 * torch.randn(2, model.size))
+    for loads in (GaussianCoordinates(1, 0.4, robot.rod.force_scale), PointCoordinates(1, 0.4, robot.rod.force_scale)):
+        problem = posed(s, torch.zeros(2, 3, 3), 1e-3, robot, loads, tension, offsets, registration=Registration())
+        start = problem.state.join(loads.start().expand(2, -1), torch.zeros(2, 6))
+        check(problem, start + 0.3 * torch.randn(2, problem.size))
 
 
 def test_derivatives_are_exact_at_zero_load_zero_strain_and_zero_rotation():
     robot = busy_robot()
-    coordinates = GaussianCoordinates(2, 0.4, robot.rod.force_scale)
-    model = Model(robot, coordinates, registration=True)
-    markers = Markers(T([0.1, 0.4]), torch.zeros(1, 2, 3), torch.zeros(2, 3), T([[0.0, 0.0]]))
-    check(model, markers, model.join(coordinates.start().unsqueeze(0), torch.zeros(1, 6)))
+    loads = GaussianCoordinates(2, 0.4, robot.rod.force_scale)
+    s, tension, offsets = T([0.1, 0.4]), T([[0.0, 0.0]]), torch.zeros(2, 3)
+    problem = posed(s, torch.zeros(1, 2, 3), 1e-3, robot, loads, tension, offsets, registration=Registration())
+    check(problem, problem.state.join(loads.start().unsqueeze(0), torch.zeros(1, 6)))
 
 
 def test_rotation_vectors_are_romas_and_smooth_at_zero():
@@ -57,9 +58,8 @@ def test_the_covariance_of_a_gaussians_report_goes_by_its_derivative():
             return torch.cat([report.force, report.location.unsqueeze(-1), report.width.unsqueeze(-1)], -1).flatten(-2)
 
         _, whole = pointwise_jacobian(described, gamma)
-        x = torch.cat([gamma, torch.randn(5, 6)], -1)
-        root = torch.randn(5, c.size + 6, c.size + 6)
-        found = load_covariance(Model(steel_rod(), c), x, root @ root.mT)
+        root = torch.randn(5, c.size, c.size)
+        own = root @ root.mT
+        found = load_covariance(c, gamma, own)
         J = whole.unflatten(1, (2, 4))
-        own = (root @ root.mT)[:, None, : c.size, : c.size]
-        assert torch.allclose(found, J @ own @ J.mT, rtol=1e-12, atol=1e-14)
+        assert torch.allclose(found, J @ own.unsqueeze(1) @ J.mT, rtol=1e-12, atol=1e-14)

@@ -1,10 +1,10 @@
-"""The estimator for streams: frame after frame it finds what a batch finds, with missing markers, jumps and lost frames between."""
+"""The tracker: frame after frame it finds what a batch finds, with missing markers, jumps and lost frames between."""
 
 import pytest
 import torch
 
 from tests.robots import T, busy_robot, steel_rod
-from torchrod import Estimator, GaussianCoordinates, Model, PointForces, Status, solve_shape
+from torchrod import GaussianCoordinates, PointForces, Status, Tracker, Unknowns, solve_shape
 from torchrod.util.threads import kernel_threads, one_thread
 
 FRAMES = 25
@@ -24,8 +24,8 @@ def test_frame_after_frame(kind):
     p = solve_shape(robot, (PointForces(force, at),), tension, s, FRAMES).p
     p = p + 2e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
     p[8, 3], p[12] = torch.nan, torch.nan
-    estimator = Estimator(Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")), s, 2e-4)
-    fits = [estimator(p[k], None if tension is None else tension[k]) for k in range(FRAMES)]
+    tracker = Tracker(robot, Unknowns(GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")), s, 2e-4)
+    fits = [tracker(p[k], None if tension is None else tension[k]) for k in range(FRAMES)]
     seen = [k for k in range(FRAMES) if k != 12]
     assert Status(int(fits[12].status)) is Status.INVALID
     assert all(bool(fits[k].accepted) for k in seen)
@@ -42,13 +42,13 @@ def test_a_jump_is_followed_and_reset_forgets():
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     force, at = T([[[0.9, 0.0, 0.0]], [[-0.9, 0.3, 0.0]]]), T([[0.39], [0.15]])
     p = solve_shape(robot, (PointForces(force, at),), None, s, 2).p
-    estimator = Estimator(Model(robot, GaussianCoordinates(1, 0.4, 1.0, "point")), s, 1e-4)
-    fits = [estimator(p[0]), estimator(p[1])]
+    tracker = Tracker(robot, Unknowns(GaussianCoordinates(1, 0.4, 1.0, "point")), s, 1e-4)
+    fits = [tracker(p[0]), tracker(p[1])]
     for fit, f in zip(fits, force, strict=True):
         assert bool(fit.accepted)
         assert float((fit.force[0, 0] - f[0, :2]).norm()) < 0.02
-    estimator.reset()
-    again = estimator(p[1])
+    tracker.reset()
+    again = tracker(p[1])
     assert torch.allclose(again.force, fits[1].force, atol=1e-4)
 
 

@@ -1,12 +1,12 @@
 """What is kept from call to call holds no longer than the tensors it was worked out from."""
 
 import torch
+from torchrod.util.kept import kept, version
 
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import GaussianCoordinates, Markers, Model, Robot, cold_start, estimate
 from torchrod.estimation.at_rest import without_load
 from torchrod.mechanics.rod import Rod
-from torchrod.util.kept import kept, version
 
 S = T([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
 
