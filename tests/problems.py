@@ -23,3 +23,10 @@ def posed(
     robot = robot or steel_rod()
     loads = GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale) if loads is None else loads
     return Problem(robot, Unknowns(loads, **unknown), [Markers(s, positions, noise, offsets)], tension, steps)
+
+
+def unknowns_of(
+    robot: Robot, count: int = 1, prior: str = "contact", locations: tuple[float, ...] | None = None, **rest
+) -> Unknowns:
+    """So many Gaussian loads on a robot; rest: as in Unknowns."""
+    return Unknowns(GaussianCoordinates(count, robot.rod.length, robot.rod.force_scale, prior, locations), **rest)

@@ -91,7 +91,7 @@ def test_a_bent_rod_is_not_misplaced():
     """Every reference shape, also with its base frame off by 5 mm, and with half of its markers."""
     for case in reference("shape"):
         z = torch.tensor([case["positions"], case["positions"]]) + 3e-3
-        markers = Markers(torch.tensor(case["s"]), z)
+        markers = Markers(torch.tensor(case["s"]), z, 1e-3)
         z[1, ::2] = torch.nan
         for b in (0, 1):
             assert misplaced(markers, b, case["robot"]["length"]) == "", case["name"]
@@ -103,8 +103,8 @@ def test_the_unit_is_told_however_the_rod_is_bent():
     for case in reference("shape"):
         z, s = torch.tensor([case["positions"]]), torch.tensor(case["s"])
         for factor, name in ((1e6, "micrometres"), (1e3, "millimetres"), (1e2, "centimetres"), (39.37, "inches")):
-            assert f"are they in {name}?" in too_far(Markers(s, factor * z), case["robot"]["length"]), case["name"]
-        assert too_far(Markers(s, z), case["robot"]["length"]) == ""
+            assert f"are they in {name}?" in too_far(Markers(s, factor * z, 1e-3), case["robot"]["length"]), case["name"]
+        assert too_far(Markers(s, z, 1e-3), case["robot"]["length"]) == ""
 
 
 @pytest.mark.parametrize("options", [["--contacts", "2"], ["--contacts", "auto"], ["--contacts", "auto", "--noise", "auto"]])

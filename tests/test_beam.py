@@ -10,8 +10,9 @@ import csv
 import pytest
 import torch
 
+from tests.problems import unknowns_of
 from tests.robots import T
-from torchrod import GaussianCoordinates, Markers, Model, Robot, Rod, Tendons, estimate
+from torchrod import Markers, Problem, Robot, Rod, Tendons, estimate
 
 E, NU, RHO, A, L = 263824.0, 0.499, 1070.0, 0.03, 0.1
 
@@ -31,13 +32,12 @@ def tip_markers(shared, run: str) -> Markers:
     )
     centre = (start.max(0).values + start.min(0).values) / 2
     centre[2] = start[:, 2].mean()
-    return Markers(T([L] * 3), (end - centre + T([0.0, 0.0, L])).unsqueeze(0), start - centre)
+    return Markers(T([L] * 3), (end - centre + T([0.0, 0.0, L])).unsqueeze(0), 5e-4, start - centre)
 
 
 def fit(shared, run: str, location):
     robot = beam()
-    coordinates = GaussianCoordinates(1, L, robot.rod.force_scale, "contact", location)
-    return estimate(Model(robot, coordinates), tip_markers(shared, run), 5e-4)
+    return estimate(Problem(robot, unknowns_of(robot, locations=location), [tip_markers(shared, run)]))
 
 
 @pytest.mark.parametrize("run", ["gravity_V2_a", "gravity_V2_b"])

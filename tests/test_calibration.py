@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.problems import unknowns_of
 from torchrod import (
-    GaussianCoordinates,
     Markers,
-    Model,
     PointForces,
+    Problem,
     Robot,
     Rod,
     Settings,
@@ -56,15 +56,15 @@ ROBOTS = {
 }
 
 
-def shapes_of(robot: Robot, tension: list[list[float]], seed: int = 0, count: int = 8, noise: float = NOISE) -> Markers:
+def shapes_of(robot: Robot, tension: list[list[float]], seed: int = 0, count: int = 8, noise: float = NOISE) -> Shapes:
     L, generator = robot.rod.length, torch.Generator().manual_seed(seed)
     s, tau = torch.linspace(L / count, L, count), T(tension)
     p = solve_shape(robot, (), tau, s, len(tau), STEPS).p
-    return Markers(s, p + noise * torch.randn(p.shape, generator=generator), None, tau)
+    return Shapes(s, p + noise * torch.randn(p.shape, generator=generator), [f"shape-{b}" for b in range(len(tau))], None, tau)
 
 
-def run(robot: Robot, markers: Markers, stiffness: bool = False, offsets: bool = False, **rest):
-    return calibrate(robot, markers, NOISE, stiffness, offsets, steps=STEPS, **rest)
+def run(robot: Robot, shapes: Shapes, stiffness: bool = False, offsets: bool = False, noise: float = NOISE, **rest):
+    return calibrate(robot, shapes.markers(noise), shapes.tension, stiffness, offsets, steps=STEPS, **rest)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -101,9 +101,9 @@ def test_stiffness_and_offsets_are_found_where_asked(name, stiffness, offsets):
 @pytest.mark.many_fits
 def test_far_starts_end_at_the_same_place(name, factor):
     make, mass, tension = ROBOTS[name]
-    markers = shapes_of(make(), tension)
-    near, far = run(make(), markers), run(make(factor * mass), markers)
-    everything = run(make(factor * mass, E=150e9), markers, True, True) if factor < 1 else far
+    shapes = shapes_of(make(), tension)
+    near, far = run(make(), shapes), run(make(factor * mass), shapes)
+    everything = run(make(factor * mass, E=150e9), shapes, True, True) if factor < 1 else far
     assert everything.accepted
     assert float((far.values - near.values).abs()) < 0.1 * float(near.std)
 
@@ -147,16 +147,16 @@ def test_the_interval_of_log_mass_covers(monkeypatch):
     p = solve_shape(rod, (), None, s, 2, 4).p
     generator, held, repeats = torch.Generator().manual_seed(5), 0, 200
     for _ in range(repeats):
-        markers = Markers(s, p + 2e-4 * torch.randn(p.shape, generator=generator))
-        low, high = calibrate(rod, markers, 2e-4, steps=4).interval_95[0].tolist()
+        markers = Markers(s, p + 2e-4 * torch.randn(p.shape, generator=generator), 2e-4)
+        low, high = calibrate(rod, markers, steps=4).interval_95[0].tolist()
         held += low <= 0.003 <= high
     assert 0.90 <= held / repeats <= 0.99, held
 
 
 def test_residuals_larger_than_the_noise_widen_the_standard_deviations():
     make, _, tension = ROBOTS["one tendon"]
-    markers = shapes_of(make(), tension)
-    honest, small = run(make(), markers), calibrate(make(), markers, NOISE / 5, steps=STEPS)
+    shapes = shapes_of(make(), tension)
+    honest, small = run(make(), shapes), run(make(), shapes, noise=NOISE / 5)
     assert small.rescaled
     assert not small.accepted
     assert float(small.std_noise[0]) < 0.3 * float(honest.std[0])
@@ -168,17 +168,24 @@ def test_residuals_larger_than_the_noise_widen_the_standard_deviations():
 def test_missing_markers_weigh_nothing_and_lost_samples_are_named():
     make, mass, tension = ROBOTS["one tendon"]
     tension = [*tension, [1e7]]  # no equilibrium: it would crush the rod
-    markers = shapes_of(make(), tension[:5])
-    p = torch.cat([markers.positions, markers.positions[-1:]])
+    known = shapes_of(make(), tension[:5])
+    p = torch.cat([known.positions, known.positions[-1:]])
     p[0] = torch.nan
     p[1, 2:4] = torch.nan
-    found = run(make(), Markers(markers.s, p, None, T(tension)))
+    found = run(make(), Shapes(known.s, p, list("abcdef"), None, T(tension)))
     assert found.used.tolist() == [False, True, True, True, True, False]
     assert found.dof == 3 * (8 * 4 - 2) - 1
     assert found.accepted
     assert abs(float(found.values[0]) - mass) < 3 * float(found.std[0])
     tension[2] = [math.nan]
-    assert run(make(), Markers(markers.s, p, None, T(tension))).used.tolist() == [False, True, False, True, True, False]
+    assert run(make(), Shapes(known.s, p, list("abcdef"), None, T(tension))).used.tolist() == [
+        False,
+        True,
+        False,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_markers_beside_the_centre_line_and_gravity_of_each_sample():
@@ -187,8 +194,8 @@ def test_markers_beside_the_centre_line_and_gravity_of_each_sample():
     s, tau, offsets = torch.linspace(0.07, 0.56, 8), T(tension), 0.02 * torch.eye(3).repeat(3, 1)[:8]
     shape = solve_shape(truth, (), tau, s, 5, STEPS)
     noise = NOISE * torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(1))
-    markers = Markers(s, shape.p + rotate(shape.q, offsets) + noise, offsets, tau)
-    found = run(replace(truth, rod=make(0.1).rod), markers, True)
+    shapes = Shapes(s, shape.p + rotate(shape.q, offsets) + noise, list("abcde"), offsets, tau)
+    found = run(replace(truth, rod=make(0.1).rod), shapes, True)
     assert found.accepted
     assert abs(float(found.values[0]) - mass) < 3 * float(found.std[0])
 
@@ -199,7 +206,7 @@ def test_a_parameter_that_does_not_show_is_named():
     straight = Rod.circular(0.56, 0.02, 207e9, 79e9, 0.252)  # stiff, and gravity along it
     robot = replace(up, rod=straight, tendons=Tendons(()))
     s = torch.linspace(0.1, 0.56, 5)
-    found = calibrate(robot, Markers(s, solve_shape(robot, (), None, s, 1, STEPS).p), 1e-3, steps=STEPS)
+    found = calibrate(robot, Markers(s, solve_shape(robot, (), None, s, 1, STEPS).p, 1e-3), steps=STEPS)
     assert found.undetermined == ("mass_per_length",)
     assert "hardly determine mass_per_length" in found.message
 
@@ -227,10 +234,10 @@ def test_an_offset_shifts_the_readings(fast, monkeypatch):
     alpha = 0.1 * torch.ones(2, 6)
     marched = [shape_from_base(r, (), alpha, t, s, 2).p for r, t in ((offset, readings), (plain, readings + d))]
     assert float((marched[0] - marched[1]).abs().max()) < 1e-12
-    coordinates = GaussianCoordinates(1, 0.56, plain.rod.force_scale)
-    x = 0.1 * torch.ones(2, coordinates.size + 6)
+    unknowns = unknowns_of(plain)
+    x = 0.1 * torch.ones(2, unknowns.loads.size + 6)
     seen = [
-        Model(r, coordinates, steps=2).linearized(x, Markers(s, a.p, None, t))
+        Problem(r, unknowns, [Markers(s, a.p, NOISE)], t, steps=2).linearized(x)
         for r, t in ((offset, readings), (plain, readings + d))
     ]
     assert all(float((u - v).abs().max()) < 1e-12 * float(u.abs().max()) for u, v in zip(*seen, strict=True))
@@ -265,11 +272,11 @@ K_bt = [
 ]"""
 
 
-def files(folder: Path, robot: str, markers: Markers) -> tuple[str, str]:
-    path, shapes = folder / "robot.toml", folder / "shapes.csv"
+def files(folder: Path, robot: str, shapes: Shapes) -> tuple[str, str]:
+    path, written = folder / "robot.toml", folder / "shapes.csv"
     path.write_bytes(robot.encode())
-    write_shapes(shapes, Shapes(markers, [f"shape-{b}" for b in range(len(markers.positions))]))
-    return str(path), str(shapes)
+    write_shapes(written, shapes)
+    return str(path), str(written)
 
 
 @pytest.mark.parametrize("section", [CIRCLE, MATRIX], ids=["circle", "matrix"])
@@ -310,7 +317,7 @@ def test_text_that_cannot_be_edited_leaves_no_file(tmp_path, capsys):
     inline = "rod = {length = 0.4, diameter = 0.0014, youngs_modulus = 207e9, shear_modulus = 79e9, gravity = [9.81, 0, 0]}\n"
     rod = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.144), gravity=SIDEWAYS)
     s = torch.linspace(0.1, 0.4, 4)
-    robot, shapes = files(tmp_path, inline, Markers(s, solve_shape(rod, (), None, s, 1, STEPS).p))
+    robot, shapes = files(tmp_path, inline, Shapes(s, solve_shape(rod, (), None, s, 1, STEPS).p, ["0"]))
     out = tmp_path / "out.toml"
     assert main(["calibrate", robot, shapes, "--out", str(out)]) == 2
     error = capsys.readouterr().err
@@ -329,11 +336,11 @@ def test_a_calibrated_robot_estimates_better(tmp_path):
     assert main(["calibrate", robot, shapes, "--noise", "2.5e-4", "--tension-offset", "--out", out]) == 0
     s, tension = torch.linspace(0.07, 0.56, 8), T([[3.0, 2.0]])
     p = solve_shape(truth, (load,), tension, s, 1, 40).p
-    loaded = Markers(s, p + NOISE * torch.randn(p.shape, generator=torch.Generator().manual_seed(9)), None, tension)
+    loaded = Markers(s, p + NOISE * torch.randn(p.shape, generator=torch.Generator().manual_seed(9)), NOISE)
     error = {}
     for name in (robot, out):
-        model = read_robot(name)
-        fit = estimate(Model(model, GaussianCoordinates(1, 0.56, model.rod.force_scale, "point")), loaded, NOISE)
+        known = read_robot(name)
+        fit = estimate(Problem(known, unknowns_of(known, prior="point"), [loaded], tension))
         error[name] = float((fit.force[0, 0] - T([0.6, -0.3])).norm()), float((fit.location[0, 0] - 0.4).abs())
         assert bool(fit.accepted[0]) == (name == out)
     assert error[out][0] < 0.05
@@ -383,9 +390,9 @@ def test_refusals_are_one_line_and_exit_2(tmp_path, capsys, monkeypatch, name):
 
 def test_what_is_not_known_is_not_written(tmp_path, capsys):
     """Not converged: exit status 0, a message, no robot file; and a sample that is left out is named."""
-    markers = shapes_of(one_tendon(), ROBOTS["one tendon"][2])
-    markers.positions[3] = torch.nan
-    robot, shapes = files(tmp_path, PULLED, markers)
+    known = shapes_of(one_tendon(), ROBOTS["one tendon"][2])
+    known.positions[3] = torch.nan
+    robot, shapes = files(tmp_path, PULLED, known)
     out, record = tmp_path / "out.toml", tmp_path / "out.json"
     options = ["--max-iterations", "1", "--out", str(out), "--json", str(record)]
     assert main(["calibrate", robot, shapes, *options]) == 0

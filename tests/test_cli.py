@@ -6,7 +6,6 @@ import math
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import torch
 
 from tests.conftest import reference
 from tests.robots import csv_of, toml_of
-from torchrod import Model, PointCoordinates, bounds, estimate, read_robot, read_shapes
+from torchrod import Markers, PointCoordinates, Problem, Unknowns, bounds, estimate, read_robot, read_shapes
 from torchrod.analysis.marker_placement import even_layout
 from torchrod.cli import main
 from torchrod.cli.parser import COMMANDS
@@ -323,10 +322,11 @@ def test_the_tip_in_single_precision_is_the_tip(tmp_path):
     robot, s = read_robot(tmp_path / "r.toml"), np.linspace(0.1, 0.3, 5, dtype=np.float32)
     assert float(s[-1]) > 0.3
     npz(tmp_path / "s.npz", s=s, positions=np.stack([0 * s, 0 * s, s], -1)[None])
-    markers = read_shapes(tmp_path / "s.npz", robot).markers
-    assert float(markers.s[-1]) == 0.3
-    model = Model(robot, PointCoordinates(1, 0.3, robot.rod.force_scale), steps=10)
-    exact, beyond = (estimate(model, replace(markers, s=x), 1e-3) for x in (markers.s, torch.from_numpy(s.astype(float))))
+    shapes = read_shapes(tmp_path / "s.npz", robot)
+    assert float(shapes.s[-1]) == 0.3
+    unknowns = Unknowns(PointCoordinates(1, 0.3, robot.rod.force_scale))
+    seen = [Markers(x, shapes.positions, 1e-3) for x in (shapes.s, torch.from_numpy(s.astype(float)))]
+    exact, beyond = (estimate(Problem(robot, unknowns, [markers], steps=10)) for markers in seen)
     assert beyond.accepted.all()
     assert torch.allclose(exact.base_wrench, beyond.base_wrench, atol=1e-6)
 

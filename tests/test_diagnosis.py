@@ -2,20 +2,20 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import roma
 import torch
-from studies.reproduction.cases import S, study1
 
+from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
+from tests.study import study1
 from torchrod import (
-    GaussianCoordinates,
     Markers,
-    Model,
     PointForces,
-    Robot,
+    Problem,
     Settings,
     Shapes,
     diagnose,
@@ -29,14 +29,16 @@ from torchrod.cli import main
 ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"
 
 
-def model_of(robot: Robot, count: int = 1) -> Model:
-    return Model(robot, GaussianCoordinates(count, 0.4, robot.rod.force_scale))
+def seen(markers: Markers, count: int = 1) -> Problem:
+    """Markers of so many contacts on the steel rod."""
+    robot = steel_rod()
+    return Problem(robot, unknowns_of(robot, count), [markers])
 
 
 def noisy(count: int, seed: int = 3) -> Markers:
     study = study1(count, seed)
     generator = torch.Generator().manual_seed(seed)
-    return Markers(S, study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator))
+    return Markers(study.s, study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator), 1e-3)
 
 
 def off(positions: torch.Tensor) -> torch.Tensor:
@@ -49,7 +51,7 @@ def exchanged(markers: Markers, pairs: list[tuple[int, int]]) -> Markers:
     positions = markers.positions.clone()
     for b, (i, j) in enumerate(pairs):
         positions[b, [i, j]] = markers.positions[b, [j, i]]
-    return Markers(markers.s, positions)
+    return replace(markers, positions=positions)
 
 
 def test_the_cost_of_every_exchange_is_that_of_making_it():
@@ -57,7 +59,7 @@ def test_the_cost_of_every_exchange_is_that_of_making_it():
     generator = torch.Generator().manual_seed(0)
     z, fitted = torch.randn(2, 5, 3, generator=generator), torch.randn(2, 5, 3, generator=generator)
     z[1, 3] = torch.nan
-    markers = Markers(torch.linspace(0.1, 0.5, 5), z, 0.05 * torch.rand(5, 3, generator=generator))
+    markers = Markers(torch.linspace(0.1, 0.5, 5), z, 1e-3, 0.05 * torch.rand(5, 3, generator=generator))
     after, beside = _stretch(markers, z), _misfit(fitted, z)
     for i, j in ((0, 1), (1, 4), (2, 2), (0, 4)):
         order = list(range(5))
@@ -70,10 +72,9 @@ def test_the_cost_of_every_exchange_is_that_of_making_it():
 def test_exchanged_labels_are_found_and_nothing_else():
     """Neighbours 2 cm apart and far ones; the clean samples in between stay unsuspected, and the fit is not touched."""
     pairs = [(6, 7), (0, 0), (2, 15), (18, 19), (5, 5), (0, 1), (3, 9), (10, 11)]
-    markers = exchanged(noisy(8), pairs)
-    model = model_of(steel_rod())
-    fit = estimate(model, markers, 1e-3)
-    diagnosis = diagnose([(model, torch.arange(8))], markers, 1e-3, fit)
+    problem = seen(exchanged(noisy(8), pairs))
+    fit = estimate(problem)
+    diagnosis = diagnose(problem, fit)
     assert [list(c) for c in diagnosis.exchanged] == [[] if i == j else [(i, j)] for i, j in pairs]
     assert diagnosis.registration.isnan().all()
     assert "Markers 7 and 8 (s = 140 and 160 mm) look exchanged" in diagnosis.message(0)
@@ -86,10 +87,8 @@ def test_three_labels_in_a_ring_are_one_group():
     markers = noisy(1)
     positions = markers.positions.clone()
     positions[0, [4, 9, 12]] = markers.positions[0, [9, 12, 4]]
-    markers = Markers(markers.s, positions)
-    model = model_of(steel_rod())
-    fit = estimate(model, markers, 1e-3)
-    diagnosis = diagnose([(model, torch.arange(1))], markers, 1e-3, fit)
+    problem = seen(replace(markers, positions=positions))
+    diagnosis = diagnose(problem, estimate(problem))
     assert diagnosis.suspects(0)[0]["markers"] == [5, 10, 13]
     assert "5, 10 and 13" in diagnosis.message(0)
 
@@ -97,17 +96,16 @@ def test_three_labels_in_a_ring_are_one_group():
 @pytest.mark.many_fits
 def test_a_base_frame_that_is_off_is_told_with_its_size():
     clean = noisy(6)
-    markers = Markers(clean.s, off(clean.positions))
-    model = model_of(steel_rod())
-    fit = estimate(model, markers, 1e-3)
-    diagnosis = diagnose([(model, torch.arange(6))], markers, 1e-3, fit)
+    problem = seen(replace(clean, positions=off(clean.positions)))
+    fit = estimate(problem)
+    diagnosis = diagnose(problem, fit)
     assert not fit.accepted.any()
     assert torch.isfinite(diagnosis.registration).all()
     assert abs(diagnosis.registration[:, :3].norm(dim=-1).mean() - 5e-3) < 2e-3
     assert abs(diagnosis.registration[:, 3:].norm(dim=-1).mean() - math.radians(3)) < math.radians(1)
     assert "try --registration" in diagnosis.message(0)
     assert not diagnosis.one_more.any()
-    unhurt = diagnose([(model, torch.arange(6))], clean, 1e-3, estimate(model, clean, 1e-3))
+    unhurt = diagnose(seen(clean), estimate(seen(clean)))
     assert [unhurt.message(b) for b in range(6)] == [""] * 6
 
 
@@ -115,10 +113,8 @@ def test_a_base_frame_that_is_off_is_told_with_its_size():
 def test_a_load_too_few_is_no_base_frame():
     robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
     push = PointForces(T([[[0.8, 0.2, 0.0], [-0.6, 0.7, 0.0]]]), T([[0.15, 0.32]]))
-    markers = Markers(s, solve_shape(robot, (push,), None, s, 1).p)
-    model = model_of(robot)
-    fit = estimate(model, markers, 1e-3)
-    diagnosis = diagnose([(model, torch.arange(1))], markers, 1e-3, fit, Settings())
+    problem = seen(Markers(s, solve_shape(robot, (push,), None, s, 1).p, 1e-3))
+    diagnosis = diagnose(problem, estimate(problem), Settings())
     assert diagnosis.one_more[0]
     assert diagnosis.registration.isnan().all()
 
@@ -130,7 +126,7 @@ def test_the_command_line_tells(tmp_path, capsys):
     clean = noisy(3)
     positions = exchanged(clean, [(6, 11), (0, 0), (0, 0)]).positions
     positions[1] = off(positions[1])
-    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(clean.s, positions), ["swapped", "moved", "clean"]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(clean.s, positions, ["swapped", "moved", "clean"]))
     for count in ("1", "auto"):
         options = ["--contacts", count, "--out", str(tmp_path / "result.json")]
         assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), *options]) == 0
@@ -160,11 +156,10 @@ def test_outliers_are_named_where_nothing_else_explains_the_markers(count):
     positions = markers.positions.clone()
     positions[::2, 6, 0] += 0.05
     positions[::2, 13, 1] -= 0.05
-    model, off = model_of(steel_rod(), count), Markers(markers.s, positions)
-    fit = estimate(model, off, 1e-3)
-    diagnosis = diagnose([(model, torch.arange(8))], off, 1e-3, fit)
+    problem = seen(replace(markers, positions=positions), count)
+    diagnosis = diagnose(problem, estimate(problem))
     assert diagnosis.outliers == ((6, 13), ()) * 4
     assert "Markers 7 and 14 (s = 140 and 280 mm) look like outliers; try --robust." in diagnosis.message(0)
     assert [group["suspicion"] for group in diagnosis.suspects(0)] == ["outlier", "outlier"]
     robust = Settings(robust=10.0)
-    assert diagnose([(model, torch.arange(8))], off, 1e-3, estimate(model, off, 1e-3, robust), robust).outliers == ((),) * 8
+    assert diagnose(problem, estimate(problem, robust), robust).outliers == ((),) * 8

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests.robots import T
-from torchrod import Markers, Shapes, WarmStart, read_robot, read_shapes, write_shapes
+from torchrod import Shapes, WarmStart, read_robot, read_shapes, write_shapes
 from torchrod.cli import main
 from torchrod.cli.arguments import writable
 from torchrod.io import read_fit
@@ -19,7 +19,7 @@ from torchrod.util.errors import InputError
 from torchrod.util.files import put, put_text
 
 ROOT = Path(__file__).resolve().parents[1]
-SHAPES = Shapes(Markers(T([0.1, 0.2]), torch.zeros(1, 2, 3)), ["0"])
+SHAPES = Shapes(T([0.1, 0.2]), torch.zeros(1, 2, 3), ["0"])
 
 
 def full(_):

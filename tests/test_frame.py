@@ -2,16 +2,17 @@
 
 import json
 import math
-from dataclasses import replace
 
 import pytest
 import roma
 import torch
-from studies.reproduction.cases import S, study1
 
+from tests.problems import unknowns_of
 from tests.robots import T
-from torchrod import GaussianCoordinates, Markers, Model, Shapes, common_frame, estimate, write_shapes
+from tests.study import Study, study1
+from torchrod import Markers, Problem, Registration, Scope, Shapes, common_frame, estimate, write_shapes
 from torchrod.cli import main
+from torchrod.estimation.shared import widened
 
 SHIFT = 5e-3 * T([0.6, 0.0, 0.8], dtype=torch.float64)
 TURN = math.radians(3) * T([0.8, -0.6, 0.0], dtype=torch.float64)
@@ -22,27 +23,26 @@ def shapes(count: int):
     """Study 1 with 1 mm noise: as it is, and from a base frame that is off by 5 mm and 3 degrees."""
     study, generator = study1(count), torch.Generator().manual_seed(2)
     seen = study.positions + 1e-3 * torch.randn(study.positions.shape, generator=generator)
-    return study, Markers(S, seen), Markers(S, seen @ roma.rotvec_to_rotmat(TURN).T + SHIFT)
+    return study, Markers(study.s, seen, 1e-3), Markers(study.s, seen @ roma.rotvec_to_rotmat(TURN).T + SHIFT, 1e-3)
 
 
-def model_of(study, registration: bool) -> Model:
-    return Model(study.robot, GaussianCoordinates(1, 0.4, study.robot.rod.force_scale), registration)
+def problem_of(study: Study, markers: Markers, registration: Registration | None = None) -> Problem:
+    return Problem(study.robot, unknowns_of(study.robot, registration=registration), [markers])
 
 
 @pytest.mark.many_fits
 def test_many_shapes_tell_the_frame():
     """20 shapes: errors within 1.3 of those with a perfect frame, where every shape by itself has several times as much."""
     study, perfect, moved = shapes(20)
-    known, apart = model_of(study, False), model_of(study, True)
-    everyone = torch.arange(20)
-    each = estimate(apart, moved, 1e-3)
-    frame = common_frame([(apart, everyone)], moved, 1e-3, each)
+    apart, known, everyone = problem_of(study, moved, Registration()), unknowns_of(study.robot), torch.arange(20)
+    each = estimate(apart)
+    frame = common_frame(apart, [(apart.unknowns, everyone)], each)
     assert (frame.zeta[:3] - SHIFT).norm() < 1e-3
     assert (frame.zeta[3:] - TURN).norm() < math.radians(0.7)
-    corrected = frame.corrected(moved)
-    plain = estimate(known, corrected, 1e-3)
-    fit = frame.widened([(known, everyone)], corrected, 1e-3, plain)
-    best = estimate(known, perfect, 1e-3)
+    corrected = frame.corrected(apart).of(known)
+    plain = estimate(corrected)
+    fit = widened(corrected, [(known, everyone)], Registration(), frame, plain)
+    best = estimate(problem_of(study, perfect))
     for what in ("location", "magnitude"):
         truth = study.location if what == "location" else study.force.norm(dim=-1)
         mean = [float((getattr(f, what)[:, 0] - truth).abs().mean()) for f in (best, fit, each)]
@@ -51,17 +51,20 @@ def test_many_shapes_tell_the_frame():
     assert (fit.location_std > plain.location_std).all()
     assert fit.registration is not None
     assert torch.equal(fit.registration, frame.zeta.expand(20, 6))
+    together = estimate(problem_of(study, moved, Registration(scope=Scope.SHARED)))
+    for name in ("x", "registration", "location", "load_covariance"):
+        assert torch.equal(getattr(together, name), getattr(fit, name)), f"{name}: in one call what the steps come to"
     assert torch.linalg.eigvalsh(frame.covariance).min() > 0
 
 
 def test_the_share_of_the_frame_is_that_of_a_joint_covariance():
     """One shape by itself: common_frame and `widened` together are the registration of that shape, to first order."""
     study, _, moved = shapes(1)
-    known, apart, first = model_of(study, False), model_of(study, True), torch.arange(1)
-    each = estimate(apart, moved, 1e-3)
-    frame = common_frame([(apart, first)], moved, 1e-3, each)
-    corrected = frame.corrected(moved)
-    fit = frame.widened([(known, first)], corrected, 1e-3, estimate(known, corrected, 1e-3))
+    apart, known, first = problem_of(study, moved, Registration()), unknowns_of(study.robot), torch.arange(1)
+    each = estimate(apart)
+    frame = common_frame(apart, [(apart.unknowns, first)], each)
+    corrected = frame.corrected(apart).of(known)
+    fit = widened(corrected, [(known, first)], Registration(), frame, estimate(corrected))
     assert each.registration is not None
     assert torch.allclose(frame.zeta, each.registration[0], atol=2e-3)
     assert torch.allclose(fit.location_std, each.location_std, rtol=0.15)
@@ -73,7 +76,7 @@ def test_a_count_that_no_shape_asks_for(tmp_path, capsys):
     """`--contacts auto` of a few shapes: a model that was tried and not chosen has more unknowns than the fits that were kept."""
     moved = shapes(3)[2]
     (tmp_path / "robot.toml").write_text(ROD)
-    write_shapes(tmp_path / "shapes.csv", Shapes(moved, ["a", "b", "c"]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(moved.s, moved.positions, ["a", "b", "c"]))
     command = ["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), "--noise", "1e-3"]
     assert main([*command, "--registration", "--one-frame", "--contacts", "auto", "--out", str(tmp_path / "r.json")]) == 0
     assert [len(r["loads"]) for r in json.loads((tmp_path / "r.json").read_text())["results"]] == [1, 1, 1]
@@ -86,7 +89,7 @@ def test_the_command_line(tmp_path, capsys):
     positions = moved.positions.clone()
     positions[5] = positions[5].flip(0)
     (tmp_path / "robot.toml").write_text(ROD)
-    write_shapes(tmp_path / "shapes.csv", Shapes(Markers(S, positions), [str(b) for b in range(12)]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(study.s, positions, [str(b) for b in range(12)]))
     files = [str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv")]
     for count in ("1", "auto"):
         out = str(tmp_path / "result.json")
@@ -113,10 +116,10 @@ def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
     plate = 0.2 * torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
     noise = 1e-3 * torch.randn(40, 4, 3, generator=torch.Generator().manual_seed(3))
     seen = plate @ roma.rotvec_to_rotmat(TURN).T + SHIFT + noise
-    offsets = torch.cat([plate, plate.new_zeros(len(S), 3)])
-    both = Markers(torch.cat([plate.new_zeros(4), S]), torch.cat([seen, moved.positions], 1), offsets)
-    apart = model_of(study, True)
-    fits = [estimate(model_of(study, False), perfect, 1e-3), estimate(apart, both, 1e-3), estimate(apart, moved, 1e-3)]
+    offsets = torch.cat([plate, plate.new_zeros(len(study.s), 3)])
+    both = Markers(torch.cat([plate.new_zeros(4), study.s]), torch.cat([seen, moved.positions], 1), 1e-3, offsets)
+    apart = [estimate(problem_of(study, markers, Registration())) for markers in (both, moved)]
+    fits = [estimate(problem_of(study, perfect)), *apart]
     for what, truth in (("location", study.location), ("magnitude", study.force.norm(dim=-1))):
         best, with_plate, without = (float((getattr(fit, what)[:, 0] - truth).abs().mean()) for fit in fits)
         assert with_plate < 1.7 * best, what
@@ -127,10 +130,10 @@ def test_markers_on_the_base_plate_tell_the_frame_of_each_shape():
 def test_a_frame_that_is_known_better(tmp_path, capsys):
     """--frame-std: the prior of a registration; a frame that is known to 0.01 mm stays where it is."""
     study, _, moved = shapes(1)
-    prior = [replace(model_of(study, True), frame_std=std).prior()[1][-12:-6] for std in (None, (2e-3, 0.01))]
+    prior = [problem_of(study, moved, known).precision[-12:-6] for known in (Registration(), Registration(2e-3, 0.01))]
     assert torch.allclose(prior[1] / prior[0], T([100.0] * 3 + [17.5**2] * 3))
     (tmp_path / "robot.toml").write_text(ROD)
-    write_shapes(tmp_path / "shapes.csv", Shapes(moved, ["0"]))
+    write_shapes(tmp_path / "shapes.csv", Shapes(moved.s, moved.positions, ["0"]))
     command = ["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), "--out", str(tmp_path / "result.json")]
     shifts = []
     for options in ([], ["--frame-std", "1e-5", "1e-5"]):

@@ -3,17 +3,17 @@
 import csv
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.conftest import reference
+from tests.problems import unknowns_of
 from tests.robots import T, busy_robot, steel_rod, toml_of
-from torchrod import GaussianCoordinates, Markers, Model, PointForces, Robot, Rod, bounds, estimate, load_bound, place, solve_shape
+from torchrod import Markers, PointForces, Problem, Registration, Robot, Rod, bounds, estimate, load_bound, place, solve_shape
 from torchrod.analysis.marker_placement import KNOWN, _information, even_layout
-from torchrod.analysis.observability import covariance, held, noncentrality, push_model, pushed, seen_by, sensitivity
+from torchrod.analysis.observability import covariance, held, noncentrality, push_problem, pushed, seen_by, sensitivity
 from torchrod.cli import main
 
 AT = torch.linspace(0.04, 0.36, 5, dtype=torch.float64)
@@ -35,9 +35,9 @@ def test_the_bound_is_the_scatter_of_estimates():
     push = PointForces(torch.nn.functional.pad(force, (0, 1)).unsqueeze(1), at.unsqueeze(1))
     shape = solve_shape(robot, (push,), None, s, 1)
     noisy = shape.p + noise * torch.randn(200, 20, 3, generator=torch.Generator().manual_seed(5))
-    fit = estimate(Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")), Markers(s, noisy), noise)
+    fit = estimate(Problem(robot, unknowns_of(robot, prior="point"), [Markers(s, noisy, noise)]))
     assert bool((fit.status == 0).all())
-    location, magnitude = load_bound(robot, Markers(s, shape.p), force, at, shape.base_wrench, noise)
+    location, magnitude = load_bound(robot, Markers(s, shape.p, noise), force, at, shape.base_wrench)
     assert abs(float(fit.location[:, 0].std() / location) - 1) < 0.15
     assert abs(float(fit.magnitude[:, 0].std() / magnitude) - 1) < 0.15
 
@@ -46,16 +46,15 @@ def test_the_bound_is_that_of_the_whole_state():
     """Alpha eliminated by (17) against alpha in the state and (17) as weight, as in the covariance of a result."""
     robot, s = busy_robot(), T([0.1, 0.2, 0.3, 0.4])
     force, at, tension = T([[0.6, -0.35], [0.2, 0.5]]), T([0.25, 0.35]), T([[3.0, 2.0]]).expand(2, -1)
-    model = push_model(robot, registration=True)
-    x = pushed(model, force, at, tension)
-    markers = Markers(s, torch.zeros(2, 4, 3), None, tension)
-    J = sensitivity(model, x, markers, KNOWN).flatten(1, 2) / 1e-3
-    C, singular = covariance(J.mT @ J + held(model, KNOWN))
+    problem = push_problem(robot, Markers(s, torch.zeros(2, 4, 3), 1e-3), tension, Registration())
+    x = pushed(problem, force, at)
+    J = sensitivity(problem, x, KNOWN).flatten(1, 2) / 1e-3
+    C, singular = covariance(J.mT @ J + held(problem, KNOWN))
     assert not singular.any()
-    _, H = model.linearized(x, markers)
+    _, H = problem.linearized(x)
     H = torch.cat([H[..., :3], H[..., 4:]], -1)
-    w = model.exact_weights(model.weights(markers, 1e-3))
-    A = H.mT @ (w.unsqueeze(-1) * H) + torch.diag(torch.cat([torch.zeros(3), model.prior()[1][4:]]))
+    w = problem.exact_weights
+    A = H.mT @ (w.unsqueeze(-1) * H) + torch.diag(torch.cat([torch.zeros(3), problem.precision[4:]]))
     whole = torch.linalg.inv(A).diagonal(dim1=-2, dim2=-1)[:, :3]
     t = at / 0.4
     ours = C.diagonal(dim1=-2, dim2=-1)[:, :3] * torch.stack([torch.ones(2), torch.ones(2), (t * (1 - t)) ** -2], -1)
@@ -103,7 +102,7 @@ def test_scale_invariance():
         assert torch.allclose(getattr(two, name), 2 * getattr(one, name), rtol=1e-6), name
 
 
-@pytest.mark.parametrize("registration", [False, True])
+@pytest.mark.parametrize("registration", [None, Registration()], ids=["", "registration"])
 def test_more_markers_and_more_knowledge_only_help(registration):
     robot, tension = busy_robot(), T([3.0, 2.0])
     few = bounds(robot, S[1::2], 1e-3, 1.0, AT[1:3], tension, registration, directions=4)
@@ -117,7 +116,7 @@ def test_more_markers_and_more_knowledge_only_help(registration):
         assert bool((known.location_std < many.location_std).all())
 
 
-@pytest.mark.parametrize("registration", [False, True])
+@pytest.mark.parametrize("registration", [None, Registration()], ids=["", "registration"])
 def test_information_adds_up(registration):
     """The sum over markers is the information of all of them at once."""
     robot, tension, s = busy_robot(), T([3.0, 2.0]), T([0.1, 0.17, 0.3, 0.4])
@@ -125,15 +124,14 @@ def test_information_adds_up(registration):
     A, known = _information(robot, candidates, 1e-3, 1.0, 0.1, tension, registration, 4, 40)
     at = [int((candidates - x).abs().argmin()) for x in s]
     C, _ = covariance(known + A[at].sum(0))
-    model = push_model(robot, registration)
     where = torch.linspace(0.1, 0.397, 24).repeat_interleave(4)
     F = T([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]).repeat(24, 1)
-    x = pushed(model, F, where, tension.expand(96, -1))
-    markers = seen_by(candidates, where, tension)
-    chosen = torch.zeros(len(markers.s), dtype=torch.bool).index_fill(0, T(at), True)
-    markers = replace(markers, positions=torch.where(chosen[:, None], 0.0, torch.nan).expand(96, -1, 3))
-    wrench = model.split(x)[2]
-    location, _ = load_bound(robot, markers, F, where, wrench, 1e-3, registration)
+    everyone = seen_by(candidates, where, 1e-3)
+    chosen = torch.zeros(len(everyone.s), dtype=torch.bool).index_fill(0, T(at), True)
+    markers = Markers(everyone.s, torch.where(chosen[:, None], 0.0, torch.nan).expand(96, -1, 3), 1e-3)
+    problem = push_problem(robot, markers, tension, registration)
+    wrench = problem.state.base.of(pushed(problem, F, where))
+    location, _ = load_bound(robot, markers, F, where, wrench, tension, registration)
     told = location < 0.4  # what is not on the rod is not located, and round-off is all there is to compare
     assert int(told.sum()) > 60
     assert float((0.4 * C[:, 2, 2].sqrt() / location - 1)[told].abs().max()) < 1e-7  # round-off, times the condition of A

@@ -9,15 +9,17 @@ import pytest
 import torch
 
 from tests.conftest import reference
+from tests.problems import unknowns_of
 from tests.robots import T, csv_of, steel_rod, toml_of
 from torchrod import (
     FourierCoordinates,
     GaussianCoordinates,
     Markers,
-    Model,
     PointCoordinates,
     PointForces,
+    Problem,
     Settings,
+    Unknowns,
     estimate,
     load_profile,
     solve_shape,
@@ -28,30 +30,30 @@ from torchrod.estimation.load_profile import joined_profile
 S20 = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 
 
-def contact(force: list[float], place: float) -> Markers:
+def contact(force: list[float], place: float, noise: float = 1e-3) -> Markers:
     shape = solve_shape(steel_rod(), (PointForces(T([[[*force, 0.0]]]), T([[place]])),), None, S20, 1)
-    return Markers(S20, shape.p)
+    return Markers(S20, shape.p, noise)
 
 
-def drawn(count: int) -> tuple[Model, torch.Tensor, Markers]:
+def drawn(count: int) -> tuple[Problem, torch.Tensor]:
     """Contacts as the prior has them, with 1 mm noise."""
     robot, generator = steel_rod(), torch.Generator().manual_seed(5)
-    coordinates = GaussianCoordinates(1, 0.4, robot.rod.force_scale)
+    unknowns = unknowns_of(robot)
     size, angle, place = torch.rand(3, count, generator=generator)
     size, angle = (0.5 + 0.5 * size) / robot.rod.force_scale, 2 * math.pi * angle
-    log_c = coordinates.prior()[0][3] + torch.randn(count, generator=generator)
+    log_c = unknowns.loads.prior()[0][3] + torch.randn(count, generator=generator)
     gamma = torch.stack([size * angle.cos(), size * angle.sin(), torch.logit(0.25 + 0.7 * place), log_c], -1)
-    p = solve_shape(robot, coordinates.loads(gamma), None, S20, count, 80).p
-    return Model(robot, coordinates), gamma, Markers(S20, p + 1e-3 * torch.randn(p.shape, generator=generator))
+    p = solve_shape(robot, unknowns.loads.loads(gamma), None, S20, count, 80).p
+    return Problem(robot, unknowns, [Markers(S20, p + 1e-3 * torch.randn(p.shape, generator=generator), 1e-3)]), gamma
 
 
 @pytest.mark.many_fits
 def test_the_band_holds_the_truth():
-    model, gamma, markers = drawn(200)
-    fit = estimate(model, markers, 1e-3)
-    profile = load_profile(model, fit.x, fit.covariance)
+    problem, gamma = drawn(200)
+    fit = estimate(problem)
+    profile = load_profile(problem, fit.x, fit.covariance)
     assert profile is not None
-    f = model.coordinates.loads(gamma)[0].density(profile.s)
+    f = problem.unknowns.loads.loads(gamma)[0].density(profile.s)
     assert f is not None
     truth = torch.cat([f[..., :2], f.norm(dim=-1, keepdim=True)], -1)
     high = profile.band[..., 2, 1]
@@ -59,40 +61,41 @@ def test_the_band_holds_the_truth():
     held = ((profile.band[..., 0] <= truth) & (truth <= profile.band[..., 1]))[there].double().mean(0)
     assert (held > 0.91).all()
     assert (held < 0.99).all()
-    alone = load_profile(model, fit.x[7:8], fit.covariance[7:8])
+    alone = load_profile(problem, fit.x[7:8], fit.covariance[7:8])
     assert alone is not None
     assert torch.allclose(alone.band[0], profile.band[7], rtol=1e-9, atol=1e-12)
 
 
 def test_a_series_is_its_own_profile_and_points_have_none():
-    robot, markers = steel_rod(), contact([0.5, -0.2], 0.25)
-    model = Model(robot, FourierCoordinates(3, 0.4, robot.rod.force_scale))
-    fit = estimate(model, markers, 1e-4)
-    profile = load_profile(model, fit.x, fit.covariance, 41)
+    robot, markers = steel_rod(), contact([0.5, -0.2], 0.25, 1e-4)
+    series = FourierCoordinates(3, 0.4, robot.rod.force_scale)
+    problem = Problem(robot, Unknowns(series), [markers])
+    fit = estimate(problem)
+    profile = load_profile(problem, fit.x, fit.covariance, 41)
     assert profile is not None
     net = torch.trapezoid(profile.f[0], profile.s, dim=0)
     assert torch.allclose(net, fit.force[0, 0], atol=1e-3)
-    density = model.coordinates.loads(fit.x[:, : model.coordinates.size])[0].density(profile.s)
+    density = series.loads(fit.x[:, : series.size])[0].density(profile.s)
     assert density is not None
     assert torch.allclose(profile.f, density[..., :2])
     assert (profile.band[..., :2, 0] < profile.f).all()
     assert (profile.band[..., :2, 1] > profile.f).all()
-    points = Model(robot, PointCoordinates(1, 0.4, robot.rod.force_scale))
-    there = estimate(points, markers, 1e-4)
+    points = problem.of(Unknowns(PointCoordinates(1, 0.4, robot.rod.force_scale)))
+    there = estimate(points)
     assert load_profile(points, there.x, there.covariance) is None
-    assert joined_profile([(points, torch.arange(1))], there.x, there.covariance) is None
+    assert joined_profile(points, [(points.unknowns, torch.arange(1))], there.x, there.covariance) is None
 
 
 def test_no_load_no_band_and_no_knowledge():
     """Without loads the profile is zero; a fit that has not converged has a profile without a band."""
     robot, markers = steel_rod(), contact([0.5, -0.2], 0.25)
-    none = Model(robot, GaussianCoordinates(0, 0.4, robot.rod.force_scale))
-    fit = estimate(none, markers, 1e-3)
+    none = Problem(robot, unknowns_of(robot, 0), [markers])
+    fit = estimate(none)
     profile = load_profile(none, fit.x, fit.covariance)
     assert profile is not None
     assert not profile.band.any()
-    one = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale))
-    hasty = estimate(one, markers, 1e-3, Settings(max_iterations=2, restarts=()))
+    one = none.of(unknowns_of(robot))
+    hasty = estimate(one, Settings(max_iterations=2, restarts=()))
     profile = load_profile(one, hasty.x, hasty.covariance)
     assert profile is not None
     assert profile.f.isfinite().all()
@@ -101,8 +104,8 @@ def test_no_load_no_band_and_no_knowledge():
 
 def test_the_covariance_of_magnitude_and_location():
     """The diagonal is the reported spread; on this rod a push farther out is weaker, so they are correlated negatively."""
-    model = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
-    fit = estimate(model, contact([0.5, -0.2], 0.25), 1e-3)
+    unknowns = Unknowns(GaussianCoordinates(1, 0.4, 1.0))
+    fit = estimate(Problem(steel_rod(), unknowns, [contact([0.5, -0.2], 0.25)]))
     C = fit.magnitude_location_covariance[0, 0]
     assert torch.allclose(C.diagonal().sqrt(), torch.stack([fit.magnitude_std[0, 0], fit.location_std[0, 0]]))
     assert C[0, 1] < 0

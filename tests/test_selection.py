@@ -7,9 +7,9 @@ import pytest
 import torch
 from studies import contacts
 
+from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
-from torchrod import GaussianCoordinates, GaussianLoads, Markers, Model, PointForces, PointWrenches, estimate, solve_shape
-from torchrod.analysis.score_test import probe
+from torchrod import GaussianLoads, Markers, PointForces, PointWrenches, Problem, estimate, score_test, solve_shape
 from torchrod.cli import main
 
 S = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
@@ -20,7 +20,7 @@ FORCES = {0: [], 1: [(0.3, -0.6, 0.22)], 2: [(0.8, 0.2, 0.15), (-0.5, 0.7, 0.33)
 def markers_of(loads, count: int, seed: int, noise: float = 1e-3) -> Markers:
     shape = solve_shape(steel_rod(), loads, None, S, count)
     draw = torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return Markers(S, shape.p + noise * draw)
+    return Markers(S, shape.p + noise * draw, noise)
 
 
 def pushes(contacts: int) -> tuple:
@@ -28,16 +28,16 @@ def pushes(contacts: int) -> tuple:
     return (PointForces(T([[[x, y, 0.0] for x, y, _ in rows]]), T([[s for *_, s in rows]])),) if rows else ()
 
 
-def model_of(contacts: int) -> Model:
+def without_load(markers: Markers) -> Problem:
+    """Markers of the steel rod, as the hypothesis has them that there is no load."""
     robot = steel_rod()
-    return Model(robot, GaussianCoordinates(contacts, 0.4, robot.rod.force_scale))
+    return Problem(robot, unknowns_of(robot, 0), [markers])
 
 
 def test_without_a_load_the_score_is_chi_square():
     """At one place the drop has 2 degrees of freedom (mean 2); the best of 16 correlated places stays below what BIC asks for."""
-    markers = markers_of((), 200, 0)
-    fit = estimate(model_of(0), markers, 1e-3)
-    drop = probe(model_of(0), fit.x, markers, 1e-3).drop
+    problem = without_load(markers_of((), 200, 0))
+    drop = score_test(problem, estimate(problem).x).drop
     assert 2.0 < float(drop.mean()) < 6.0
     assert (drop > 3 * math.log(60)).double().mean() < 0.03
 
@@ -45,9 +45,8 @@ def test_without_a_load_the_score_is_chi_square():
 def test_the_score_points_at_the_missing_load():
     """A push of 0.3 N bends the rod by 50 mm: place to the spacing of the places, force to a third, from the fit without load."""
     push = (PointForces(T([[[0.0, 0.3, 0.0]]]), T([[0.3]])),)
-    markers = markers_of(push, 20, 1)
-    fit = estimate(model_of(0), markers, 1e-3)
-    found = probe(model_of(0), fit.x, markers, 1e-3)
+    problem = without_load(markers_of(push, 20, 1))
+    found = score_test(problem, estimate(problem).x)
     assert (found.drop > 3 * math.log(60)).all()
     assert ((0.4 * torch.sigmoid(found.eta) - 0.3).abs() < 0.04).all()
     assert (found.force * steel_rod().rod.force_scale - T([0.0, 0.3])).abs().max() < 0.1
@@ -92,9 +91,9 @@ def test_a_push_at_the_tip_competes(tmp_path):
 @pytest.mark.many_fits
 def test_what_one_sample_chooses_does_not_depend_on_its_neighbours(tmp_path):
     both = torch.cat([markers_of(pushes(k), 1, 5).positions for k in (0, 2, 1)])
-    together = run(tmp_path, Markers(S, both), "--contacts", "auto")
+    together = run(tmp_path, Markers(S, both, 1e-3), "--contacts", "auto")
     for b, sample in enumerate(together):
-        (alone,) = run(tmp_path, Markers(S, both[b : b + 1]), "--contacts", "auto")
+        (alone,) = run(tmp_path, Markers(S, both[b : b + 1], 1e-3), "--contacts", "auto")
         assert alone["evidence"]["chosen"] == sample["evidence"]["chosen"]
         for one, other in zip(alone["loads"], sample["loads"], strict=True):
             assert abs(one["magnitude_N"] - other["magnitude_N"]) < 1e-9

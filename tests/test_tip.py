@@ -7,17 +7,20 @@ import pytest
 import torch
 
 from tests.conftest import reference
+from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
 from torchrod import (
     GaussianCoordinates,
     Markers,
-    Model,
     PointForces,
     PointWrenches,
+    Problem,
+    Registration,
     Robot,
     Rod,
     Tendon,
     Tendons,
+    Unknowns,
     estimate,
     forward_jacobian,
     solve_shape,
@@ -28,7 +31,7 @@ S = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 
 
 def six_tendons():
-    """The robot of tendon_reference.json with its markers and true tip forces."""
+    """The robot of tendon_reference.json with its markers (their noise 0.1 mm), tensions and true tip forces."""
     data = reference("tendon")
     r, cases = data["robot"], data["cases"]
     E, offset = r["youngs_modulus_Pa"], r["tendon_offset_m"]
@@ -36,23 +39,18 @@ def six_tendons():
     angles = [math.radians(a) for a in r["tendon_angles_deg"]] * 2
     tendons = tuple(Tendon.straight(offset * math.cos(a), offset * math.sin(a), e) for a, e in zip(angles, ends, strict=True))
     rod = Rod.circular(sum(r["segments_m"]), 2 * r["backbone_radius_m"], E, E / (2 * (1 + r["poisson_ratio"])))
-    markers = Markers(
-        T(r["disk_arc_lengths_m"]), T([c["disk_positions_m"] for c in cases]), None, T([c["tensions_N"] for c in cases])
-    )
-    return Robot(rod, Tendons(tendons)), markers, T([c["tip_force_world_N"] for c in cases])
-
-
-def tip_model(robot: Robot, contacts: int, tip: str) -> Model:
-    return Model(robot, GaussianCoordinates(contacts, robot.rod.length, robot.rod.force_scale, "point"), tip=tip)
+    markers = Markers(T(r["disk_arc_lengths_m"]), T([c["disk_positions_m"] for c in cases]), 1e-4)
+    tension, force = (T([c[key] for c in cases]) for key in ("tensions_N", "tip_force_world_N"))
+    return Robot(rod, Tendons(tendons)), markers, tension, force
 
 
 @pytest.mark.parametrize("noise", [0.0, 2e-4])
 def test_tip_forces_of_an_independent_tendon_model(noise):
     """Without noise all 19 within 2 mN or 2 % (measured: 0.6 mN at worst); with 0.2 mm noise the 95 % region holds 17 or more."""
-    robot, markers, force = six_tendons()
+    robot, markers, tension, force = six_tendons()
     draw = torch.randn(markers.positions.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    seen = Markers(markers.s, markers.positions + noise * draw, None, markers.tension)
-    fit = estimate(tip_model(robot, 0, "force"), seen, noise or 1e-4)
+    seen = Markers(markers.s, markers.positions + noise * draw, noise or 1e-4)
+    fit = estimate(Problem(robot, unknowns_of(robot, 0, tip="force"), [seen], tension))
     assert fit.accepted.all()
     assert fit.tip is not None
     assert fit.tip_covariance is not None
@@ -69,7 +67,7 @@ def test_contact_and_tip_wrench_together():
     push = PointForces(T([[[0.5, 0.3, 0.0]]]), T([[0.2]]))
     wrench = PointWrenches(T([[[0.1, -0.2, 0.15]]]), T([[[0.01, 0.02, 0.005]]]), T([0.4]))
     shape = solve_shape(robot, (push, wrench), None, S, 1, 80)
-    fit = estimate(tip_model(robot, 1, "wrench"), Markers(S, shape.p), 1e-5)
+    fit = estimate(Problem(robot, unknowns_of(robot, prior="point", tip="wrench"), [Markers(S, shape.p, 1e-5)]))
     assert fit.accepted[0]
     assert fit.tip is not None
     error = fit.tip[0] - T([0.1, -0.2, 0.15, 0.01, 0.02, 0.005])  # the body load is a Gaussian 4 mm wide, not a point
@@ -83,12 +81,12 @@ def test_contact_and_tip_wrench_together():
 @pytest.mark.parametrize("tip", ["force", "wrench"])
 def test_the_jacobian_is_that_of_h(tip):
     """The compiled path against forward mode through the definition, on a tendon robot with contact, registration and tip."""
-    robot, markers, _ = six_tendons()
-    few = markers.take(torch.arange(2))
-    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale), registration=True, steps=10, tip=tip)
-    x = 0.3 * torch.randn(2, model.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    h, H = model.linearized(x, few)
-    value, slope = forward_jacobian(lambda x: model.h(x, few), x)
+    robot, markers, tension, _ = six_tendons()
+    few, loads = torch.arange(2), GaussianCoordinates(1, 0.4, robot.rod.force_scale)
+    problem = Problem(robot, Unknowns(loads, tip, registration=Registration()), [markers], tension, steps=10).take(few)
+    x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    h, H = problem.linearized(x)
+    value, slope = forward_jacobian(problem.h, x)
     assert (h - value).abs().max() < 1e-10
     assert (H - slope).abs().max() < 1e-9 * slope.abs().max()
 
@@ -97,7 +95,7 @@ def test_the_axial_force_on_a_straight_rod_hardly_shows():
     """Lateral 2 mN, axial hardly better than the prior of 10 force scales: a straight rod only shortens."""
     robot = steel_rod()
     straight = torch.stack([0 * S, 0 * S, S], -1).unsqueeze(0)
-    fit = estimate(tip_model(robot, 0, "force"), Markers(S, straight), 1e-3)
+    fit = estimate(Problem(robot, unknowns_of(robot, 0, tip="force"), [Markers(S, straight, 1e-3)]))
     assert fit.tip_covariance is not None
     std = fit.tip_covariance[0].diagonal().sqrt()
     assert (std[:2] < 2e-3).all()

@@ -10,23 +10,26 @@ from pathlib import Path
 
 import pytest
 import torch
-from studies.reproduction.cases import S, study1
 
+from tests.problems import unknowns_of
 from tests.robots import T, csv_of, steel_rod, toml_of
+from tests.study import study1
 from tests.test_fast import needs_compiler
 from torchrod import (
-    GaussianCoordinates,
     InputError,
     Markers,
-    Model,
+    Origin,
     PointCoordinates,
     PointForces,
+    Problem,
+    Registration,
     Robot,
     Rod,
     Settings,
     Start,
     Tendon,
     Tendons,
+    Unknowns,
     WarmStart,
     cold_start,
     estimate,
@@ -35,31 +38,32 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.evaluator import evaluator
+from torchrod.estimation.starts import Fate
 from torchrod.learned.features import GRID, features, smoothed
 from torchrod.learned.network import digest, load_checkpoint, save_checkpoint
 from torchrod.learned.warm_start import shipped
-from torchrod.util.status import Learned
 
 ROOT = Path(__file__).resolve().parents[1]
 ROD_1 = ROOT / "checkpoints" / "rod_1.safetensors"
 NOISE = 1e-3
 
 
-def model_of(robot: Robot | None = None, count: int = 1, prior: str = "contact") -> Model:
+def seen(markers: Markers, robot: Robot | None = None) -> Problem:
+    """Markers of one contact on a rod."""
     robot = robot or steel_rod()
-    return Model(robot, GaussianCoordinates(count, robot.rod.length, robot.rod.force_scale, prior))
+    return Problem(robot, unknowns_of(robot), [markers])
 
 
 def noisy(count: int, seed: int = 3) -> tuple[Markers, torch.Tensor]:
     study = study1(count, seed)
     draw = torch.randn(study.positions.shape, generator=torch.Generator().manual_seed(seed))
-    return Markers(S, study.positions + NOISE * draw), study.force
+    return Markers(study.s, study.positions + NOISE * draw, NOISE), study.force
 
 
 def turned(markers: Markers, angle: float) -> Markers:
     c, s = math.cos(angle), math.sin(angle)
-    return Markers(markers.s, markers.positions @ T([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
+    return replace(markers, positions=markers.positions @ T([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
 
 
 def test_smoothing_reads_a_beam_from_any_layout():
@@ -77,19 +81,19 @@ def test_smoothing_reads_a_beam_from_any_layout():
 
 @pytest.mark.parametrize("angle", [0.7, -2.1, math.pi])
 def test_the_prediction_turns_with_the_shape(angle):
-    model, start = model_of(), WarmStart.read(ROD_1)
+    start = WarmStart.read(ROD_1)
     markers, _ = noisy(20)
-    gamma, other = start(model, markers, NOISE).x[:, :4], start(model, turned(markers, angle), NOISE).x[:, :4]
+    gamma, other = start(seen(markers)).x[:, :4], start(seen(turned(markers, angle))).x[:, :4]
     c, s = math.cos(angle), math.sin(angle)
     assert torch.allclose(other[:, :2], gamma[:, :2] @ T([[c, -s], [s, c]]).T, atol=1e-9)
     assert torch.allclose(other[:, 2:], gamma[:, 2:], atol=1e-9)
 
 
 def test_the_prediction_turns_with_the_mirror_too():
-    model, start = model_of(), WarmStart.read(ROD_1)
+    start = WarmStart.read(ROD_1)
     markers, _ = noisy(20)
-    gamma = start(model, markers, NOISE).x[:, :4]
-    mirrored = start(model, Markers(markers.s, markers.positions * T([1.0, -1.0, 1.0])), NOISE).x[:, :4]
+    gamma = start(seen(markers)).x[:, :4]
+    mirrored = start(seen(replace(markers, positions=markers.positions * T([1.0, -1.0, 1.0])))).x[:, :4]
     assert torch.allclose(mirrored, gamma * T([1.0, -1.0, 1.0, 1.0]), atol=1e-9)
 
 
@@ -97,26 +101,30 @@ def test_the_prediction_does_not_depend_on_the_scale():
     """Three times as long, a hundred times as stiff, the same slenderness: the same dimensionless answer."""
     markers, _ = noisy(20)
     big = Robot(Rod.circular(1.2, 0.0042, 207e11, 79e11))
-    other = Markers(3 * markers.s, 3 * markers.positions)
+    other = Markers(3 * markers.s, 3 * markers.positions, 3 * NOISE)
     start = WarmStart.read(ROD_1)
-    small = start(model_of(), markers, NOISE)
-    assert torch.allclose(start(model_of(big), other, 3 * NOISE).x, small.x, rtol=0, atol=1e-6)
-    assert small.warm.all()
+    small = start(seen(markers))
+    assert torch.allclose(start(seen(other, big)).x, small.x, rtol=0, atol=1e-6)
+    assert small.challenged.all()
+    assert (small.origin == int(Origin.LEARNED)).all()
 
 
 def test_missing_markers_are_filled_in():
     """A missing marker reads as if it had never been there, and half of them may be missing."""
-    model, start = model_of(), WarmStart.read(ROD_1)
+    start = WarmStart.read(ROD_1)
     markers, force = noisy(20)
     gone, kept = [1, 8, 19], [i for i in range(20) if i not in (1, 8, 19)]
     holes = markers.positions.clone()
     holes[:, gone] = torch.nan
-    a, b = start(model, Markers(markers.s, holes), NOISE), start(model, Markers(markers.s[kept], markers.positions[:, kept]), NOISE)
+    fewer = Markers(markers.s[kept], markers.positions[:, kept], NOISE)
+    a, b = start(seen(replace(markers, positions=holes))), start(seen(fewer))
     assert torch.allclose(a.x, b.x, atol=1e-6)
     holes[:, ::2] = torch.nan
-    assert (start(model, Markers(markers.s, holes), NOISE).x[:, :2] - force).norm(dim=-1).median() < 0.15
+    assert (start(seen(replace(markers, positions=holes))).x[:, :2] - force).norm(dim=-1).median() < 0.15
     holes[0, :14] = torch.nan
-    assert start(model, Markers(markers.s, holes), NOISE).warm.tolist()[:2] == [False, True], "too few for what it knows: cold"
+    last = start(seen(replace(markers, positions=holes)))
+    assert last.challenged.tolist()[:2] == [False, True], "too few for what it knows: cold"
+    assert last.origin.tolist()[:2] == [Origin.COLD, Origin.LEARNED]
 
 
 @pytest.mark.many_fits
@@ -127,22 +135,23 @@ def test_a_samples_answer_does_not_depend_on_its_batch():
     positions[1] = torch.nan
     positions[2] = 5 * torch.randn(positions[2].shape, generator=torch.Generator().manual_seed(0))
     positions[3, 6:] = torch.nan
-    model, start, limit = model_of(), WarmStart.read(ROD_1), Settings(max_iterations=15)
-    together = estimate(model, Markers(markers.s, positions), NOISE, limit, start)
+    start, limit = WarmStart.read(ROD_1), Settings(max_iterations=15)
+    together = estimate(seen(replace(markers, positions=positions)), limit, start)
     assert together.warm_started.tolist()[0] and not together.warm_started[3]
     for i in (0, 2, 3, 4, 5):
-        alone = estimate(model, Markers(markers.s, positions[i : i + 1]), NOISE, limit, start)
+        alone = estimate(seen(replace(markers, positions=positions[i : i + 1])), limit, start)
         assert torch.allclose(together.x[i], alone.x[0], rtol=0, atol=1e-9)
         assert together.iterations[i] == alone.iterations[0]
-        assert together.learned[i] == alone.learned[0]
+        assert (together.guess[i], together.fate[i]) == (alone.guess[0], alone.fate[0])
 
 
 def test_it_saves_iterations_in_study_1():
     """200 cases with 1 mm noise: the same answers, in less than 0.6 of the iterations."""
     markers, _ = noisy(200)
-    start = find_warm_start(model_of())
+    problem = seen(markers)
+    start = find_warm_start(problem)
     assert start is not None and start.card["name"] == "rod_1"
-    cold, warm = estimate(model_of(), markers, NOISE), estimate(model_of(), markers, NOISE, start=start)
+    cold, warm = estimate(problem), estimate(problem, start=start)
     assert warm.warm_started.double().mean() > 0.98
     assert warm.iterations.double().mean() < 0.6 * cold.iterations.double().mean()
     assert warm.accepted.sum() >= cold.accepted.sum()
@@ -178,11 +187,11 @@ def test_a_bad_network_never_costs_accuracy(kind):
     else:
         network = Wild(start.network, 1e3 if kind == "1e3 forces" else math.nan)
     bad = replace(start, network=network)
-    cold, warm = estimate(model_of(), markers, NOISE), estimate(model_of(), markers, NOISE, start=bad)
+    cold, warm = estimate(seen(markers)), estimate(seen(markers), start=bad)
     assert warm.accepted.sum() >= cold.accepted.sum()
     assert (warm.chi2 < cold.chi2 + 0.01).all()
     assert torch.allclose(warm.force, cold.force, atol=0.02)
-    dropped = warm.learned == int(Learned.DROPPED)
+    dropped = (warm.guess == int(Origin.LEARNED)) & (warm.fate == int(Fate.DROPPED))
     assert dropped.any()
     assert not warm.warm_started[dropped].any()
     assert "learned start" in warm.message(int(dropped.nonzero()[0, 0]))
@@ -194,19 +203,19 @@ def test_a_bad_network_never_costs_accuracy(kind):
 def test_a_start_that_leads_nowhere_is_followed_by_a_cold_one():
     """Nearer to the markers than a cold start, so it is tried, but stuck: the cold start's answer is the one reported."""
     markers, _ = noisy(3)
-    model, limit = model_of(), Settings(max_iterations=12, restarts=())
-    cold = estimate(model, markers, NOISE, limit)
+    limit = Settings(max_iterations=12, restarts=())
+    cold = estimate(seen(markers), limit)
 
-    def stuck(model, markers, noise):
-        tight = torch.eye(model.size).repeat(len(markers.positions), 1, 1)
-        x = cold_start(model, markers, noise).x
+    def stuck(problem):
+        tight = torch.eye(problem.size).repeat(problem.batch, 1, 1)
+        x = cold_start(problem).x
         x = x + 0.5 * (cold.x - x)
         x[:, 3] = -30.0  # so wide that nothing moves any more
-        return Start(x, tight, torch.ones(len(x), dtype=torch.bool))
+        return replace(Start.at(x, Origin.LEARNED, challenged=True), Sigma0=tight)
 
-    fit = estimate(model, markers, NOISE, limit, stuck)
+    fit = estimate(seen(markers), limit, stuck)
     assert fit.accepted.all()
-    retried = fit.learned == int(Learned.RETRIED)
+    retried = (fit.guess == int(Origin.LEARNED)) & (fit.fate == int(Fate.RETRIED))
     assert retried.any()
     assert (fit.restarts[retried] == 1).all()
     assert (fit.iterations[retried] > cold.iterations[retried]).all()
@@ -217,20 +226,19 @@ def test_a_start_that_leads_nowhere_is_followed_by_a_cold_one():
 @pytest.mark.many_fits
 def test_a_failed_guess_is_followed_by_all_of_a_cold_start():
     """A push whose cold fit needs a restart, and a guess that leads nowhere: the restart must follow it, too."""
-    rod = model_of().robot
+    rod = steel_rod()
     s, force = torch.linspace(0.02, 0.4, 20), T([[[4.91, 0.0, 0.0]]])
     p = solve_shape(rod, (PointForces(force, T([[0.379]])),), None, s, 1, 160).p
-    markers, model = Markers(s, p), model_of()
-    cold = estimate(model, markers, NOISE)
+    problem = seen(Markers(s, p, NOISE), rod)
+    cold = estimate(problem)
     assert cold.restarts[0] > 0
     assert cold.accepted[0], "of the case: it needs a restart, which helps"
 
-    def stuck(model, markers, noise):
-        x = estimate(model, markers, noise, Settings(restarts=())).x
-        return Start(x, None, torch.ones(1, dtype=torch.bool))
+    def stuck(problem):
+        return Start.at(estimate(problem, Settings(restarts=())).x, Origin.LEARNED, challenged=True)
 
-    fit = estimate(model, markers, NOISE, start=stuck)
-    assert fit.learned[0] == int(Learned.RETRIED)
+    fit = estimate(problem, start=stuck)
+    assert (fit.guess[0], fit.fate[0]) == (int(Origin.LEARNED), int(Fate.RETRIED))
     assert fit.accepted[0]
     assert torch.allclose(fit.force, cold.force, atol=1e-3)
     assert fit.restarts[0] == 1 + cold.restarts[0], "the cold start and its restarts, and nothing twice"
@@ -255,19 +263,25 @@ def test_what_does_not_fit_is_said_in_one_sentence():
     tendon = Robot(steel.rod, Tendons((Tendon.straight(0.007, 0.0, 0.4),)))
     stubby = Robot(Rod.circular(0.4, 0.1, 207e9, 79e9))
     curved = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, reference_curvature=T([[0.0, 1.0, 0.0, 0.0]])))
-    scale, markers = steel.rod.force_scale, noisy(2)[0]
+    markers = noisy(2)[0]
+    problem = seen(markers)
+    points = Unknowns(PointCoordinates(1, 0.4, steel.rod.force_scale))
+
+    def of(robot: Robot, unknowns: Unknowns) -> str | None:
+        return start.misfit(replace(problem, robot=robot, unknowns=unknowns), measured=False)
+
     reasons = [
-        start.misfit(Model(steel, PointCoordinates(1, 0.4, scale))),
-        start.misfit(Model(steel, GaussianCoordinates(1, 0.4, scale, "contact", (0.2,)))),
-        start.misfit(Model(steel, GaussianCoordinates(1, 0.4, scale), registration=True)),
-        start.misfit(model_of(count=2)),
-        start.misfit(model_of(prior="distributed")),
-        start.misfit(model_of(tendon)),
-        start.misfit(model_of(stubby)),
-        start.misfit(model_of(curved)),
-        start.misfit(model_of(), noise=1e-5),
-        start.misfit(model_of(), Markers(markers.s[:4], markers.positions[:, :4])),
-        start.misfit(model_of(), Markers(markers.s, markers.positions, torch.zeros(20, 3))),
+        of(steel, points),
+        of(steel, unknowns_of(steel, locations=(0.2,))),
+        of(steel, unknowns_of(steel, registration=Registration())),
+        of(steel, unknowns_of(steel, count=2)),
+        of(steel, unknowns_of(steel, prior="distributed")),
+        of(tendon, unknowns_of(tendon)),
+        of(stubby, unknowns_of(stubby)),
+        of(curved, unknowns_of(curved)),
+        start.misfit(seen(replace(markers, noise=1e-5))),
+        start.misfit(seen(Markers(markers.s[:4], markers.positions[:, :4], NOISE))),
+        start.misfit(seen(replace(markers, offsets=torch.zeros(20, 3)))),
     ]
     words = [
         "Gaussian",
@@ -284,10 +298,14 @@ def test_what_does_not_fit_is_said_in_one_sentence():
     ]
     for reason, word in zip(reasons, words, strict=True):
         assert reason is not None and word in reason and "\n" not in reason
-    assert start.misfit(model_of(), markers, NOISE) is None
+    assert start.misfit(problem) is None
+    exact = seen(replace(markers, noise=1e-5))
+    assert start.misfit(exact, measured=False) is None
     with pytest.raises(InputError, match="noise"):
-        start(model_of(), markers, 1e-5)
-    assert not replace(start, strict=False)(model_of(), markers, 1e-5).warm.any()
+        start(exact)
+    lenient = replace(start, strict=False)(exact)
+    assert not lenient.challenged.any()
+    assert (lenient.origin == int(Origin.COLD)).all()
 
 
 def test_every_card_agrees_with_its_file():
@@ -370,7 +388,7 @@ def test_what_is_saved_is_what_is_read(tmp_path):
     network, card = load_checkpoint(ROD_1)
     save_checkpoint(tmp_path / "a.safetensors", network, card)
     again, _ = load_checkpoint(tmp_path / "a.safetensors")
-    read = features(model_of(), noisy(3)[0], NOISE)
+    read = features(seen(noisy(3)[0]))
     log_c = torch.full((3,), 6.0)
     assert torch.equal(network(read.x, read.amp, log_c).gamma, again(read.x, read.amp, log_c).gamma)
 
@@ -381,8 +399,9 @@ import sys
 sys.modules["lightning"] = None
 import torch, torchrod
 robot = torchrod.Robot(torchrod.Rod.circular(0.4, 0.0014, 207e9, 79e9))
-model = torchrod.Model(robot, torchrod.GaussianCoordinates(1, 0.4, robot.rod.force_scale))
-assert torchrod.find_warm_start(model) is not None
+unknowns = torchrod.Unknowns(torchrod.GaussianCoordinates(1, 0.4, robot.rod.force_scale))
+markers = torchrod.Markers(torch.linspace(0.02, 0.4, 20), torch.zeros(1, 20, 3), 1e-3)
+assert torchrod.find_warm_start(torchrod.Problem(robot, unknowns, [markers])) is not None
 assert not [name for name in sys.modules if name.startswith(("lightning.", "pytorch_lightning"))]
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
@@ -391,15 +410,15 @@ assert not [name for name in sys.modules if name.startswith(("lightning.", "pyto
 
 @pytest.mark.parametrize("missing", [False, True])
 def test_the_costs_of_a_guess_are_the_models(missing):
-    """They come from the forward solves; better_start would otherwise evaluate the model. Also with noise of each sample's own."""
+    """They come from the forward solves; challenged_by_cold would otherwise evaluate the model. Also with noise of each sample's."""
     markers, _ = noisy(20)
-    markers = replace(markers, sigma=torch.linspace(0.5e-3, 2e-3, 20))
+    markers = replace(markers, noise=torch.linspace(0.5e-3, 2e-3, 20))
     if missing:
         markers.positions[3, 5:9] = torch.nan
-    model = model_of()
-    start = WarmStart.read(ROD_1)(model, markers, NOISE)
-    prepared = Prepared(model.coarse, markers, model.weights(markers, NOISE))
+    problem = seen(markers)
+    start = WarmStart.read(ROD_1)(problem)
+    evaluate = evaluator(problem.coarse)
     assert start.costs is not None
     assert start.cold is not None
-    expected = torch.stack([prepared.cost(start.x), prepared.cost(start.cold)], -1)
+    expected = torch.stack([evaluate.cost(start.x), evaluate.cost(start.cold)], -1)
     assert torch.allclose(start.costs, expected, rtol=1e-4)

@@ -14,20 +14,22 @@ from torchrod import (
     DatasetSpec,
     GaussianCoordinates,
     Markers,
-    Model,
+    Origin,
     PolynomialLoads,
+    Problem,
     Robot,
     Rod,
     Settings,
     Start,
     Tendon,
     Tendons,
+    Unknowns,
     cold_start,
     estimate,
     simulate_shard,
     solve_shape,
 )
-from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.evaluator import evaluator, normal
 from torchrod.estimation.solve import CHUNK
 from torchrod.estimation.starts import in_equilibrium
 from torchrod.learned.features import features, prior_log_c
@@ -72,10 +74,9 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Draw:
-    """The robot of a block, its markers without a gap, and a truth gamma (B, 4 K) to start from; N, m."""
+    """The problem of a block, with its markers without a gap, and a truth gamma (B, 4 K) to start from."""
 
-    robot: Robot
-    markers: Markers
+    problem: Problem
     gamma: Float[Tensor, "B n"]
 
 
@@ -150,10 +151,12 @@ def contacts(recipe: Recipe, index: int, prior: str) -> Draw:
         gravity=None,
     )
     data = {name: torch.from_numpy(value) for name, value in simulate_shard(spec, 0).items()}
+    markers = Markers(data["s"], data["positions"], L * noise_of(recipe, index))
+    problem = Problem(robot, unknowns_of(recipe, robot, prior), [markers], data["tension"] if len(robot.tendons) else None)
     eta = torch.logit((data["location"] / L).clamp(max=FARTHEST_LOAD)).unsqueeze(-1)
-    log_c = torch.full_like(eta, prior_log_c(model_of(recipe, robot, prior)))
+    log_c = torch.full_like(eta, prior_log_c(problem))
     gamma = torch.cat([data["force"] / robot.rod.force_scale, eta, log_c], -1).flatten(1)
-    return Draw(robot, Markers(data["s"], data["positions"], None, data["tension"] if len(robot.tendons) else None), gamma)
+    return Draw(problem, gamma)
 
 
 def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
@@ -167,29 +170,28 @@ def smooth(recipe: Recipe, index: int, prior: str) -> Draw:
     size = low * (high / low) ** uniform(generator, B, 1, 1) * robot.rod.force_scale / L
     load = PolynomialLoads(size * torch.linalg.solve(powers, knots.unsqueeze(-1)).squeeze(-1), L)
     shape = solve_shape(robot, (load,), None, s, B)
-    gamma = model_of(recipe, robot, prior).coordinates.start().expand(B, -1)
-    noisy = shape.p + L * noise_of(recipe, index) * torch.randn(shape.p.shape, generator=generator, dtype=DTYPE)
-    return Draw(robot, Markers(s, noisy), gamma)
+    noise, unknowns = L * noise_of(recipe, index), unknowns_of(recipe, robot, prior)
+    noisy = shape.p + noise * torch.randn(shape.p.shape, generator=generator, dtype=DTYPE)
+    return Draw(Problem(robot, unknowns, [Markers(s, noisy, noise)]), unknowns.loads.start().expand(B, -1))
 
 
-def model_of(recipe: Recipe, robot: Robot, prior: str) -> Model:
-    """The model whose starts are learned."""
-    return Model(robot, GaussianCoordinates(recipe.contacts, L, robot.rod.force_scale, prior))
+def unknowns_of(recipe: Recipe, robot: Robot, prior: str) -> Unknowns:
+    """The unknowns whose starts are learned."""
+    return Unknowns(GaussianCoordinates(recipe.contacts, L, robot.rod.force_scale, prior))
 
 
-def with_gaps(markers: Markers, generator: torch.Generator) -> Markers:
+def with_gaps(problem: Problem, generator: torch.Generator) -> Problem:
     """Up to half of the markers missing, but LEAST_SEEN there."""
-    B, P = markers.positions.shape[:2]
+    B, P = problem.batch, problem.group_count
     gone = (uniform(generator, B, 1) * (P - max(LEAST_SEEN, P // 2) + 1)).floor()
     rank = uniform(generator, B, P).argsort(-1).argsort(-1)
-    positions = torch.where((rank < gone).unsqueeze(-1), torch.nan, markers.positions)
-    return Markers(markers.s, positions, markers.offsets, markers.tension)
+    return problem.without(rank < gone)
 
 
-def information(model: Model, markers: Markers, noise: float, x: Float[Tensor, "B n"], size: int) -> Float[Tensor, "B g g"]:
+def information(problem: Problem, x: Float[Tensor, "B n"]) -> Float[Tensor, "B g g"]:
     """M: the information on gamma with alpha eliminated, so that d^T M d is what an error d in gamma costs."""
-    prepared = Prepared(model, markers, model.weights(markers, noise))
-    A, _, _ = prepared.normal(prepared.sums(x)).whole(x, *model.prior())
+    A, _, _ = normal(problem, evaluator(problem).sums(x)).whole(x, problem.mean, problem.precision)
+    size = problem.state.loads.size
     cross = A[:, :size, size:]
     return A[:, :size, :size] - cross @ torch.linalg.solve(A[:, size:, size:], cross.mT)
 
@@ -202,25 +204,23 @@ def in_order(gamma: Float[Tensor, "B n"], M: Float[Tensor, "B n n"]) -> tuple[Te
     return gamma.gather(1, index), M.gather(1, rows).gather(2, index.unsqueeze(1).expand_as(M))
 
 
-def answered(model: Model, markers: Markers, noise: float, gamma: Float[Tensor, "B n"], iterations: int) -> Float[Tensor, "B n"]:
-    """x after so many iterations of the filter from a truth gamma. The start counts as cold: the answer is wanted as it is."""
-    x = in_equilibrium(model, gamma, markers)
-    at_truth = Start.known(torch.where(x.isnan(), cold_start(model, markers, noise).x, x))
-    return estimate(model, markers, noise, Settings(max_iterations=iterations, restarts=()), at_truth).x
+def answered(problem: Problem, gamma: Float[Tensor, "B g"], iterations: int) -> Float[Tensor, "B n"]:
+    """x after so many iterations of the filter from a truth gamma. Nothing challenges that start: the answer is wanted as it is."""
+    x = in_equilibrium(problem, gamma)
+    at_truth = Start.at(torch.where(x.isnan(), cold_start(problem).x, x), Origin.OTHER_FIT)
+    return estimate(problem, Settings(max_iterations=iterations, restarts=()), at_truth).x
 
 
 def block(recipe: Recipe, index: int) -> dict[str, Tensor]:
     """x, amp, log_c, target and M in the canonical frame, and the markers seen: float32, one row per case."""
-    prior, noise = recipe.priors[index % len(recipe.priors)], L * noise_of(recipe, index)
-    draw = (contacts if recipe.load == "contacts" else smooth)(recipe, index, prior)
-    model, markers = model_of(recipe, draw.robot, prior), with_gaps(draw.markers, generator_of(recipe, 10_000_019 + index))
-    size, log_c = PER_LOAD * recipe.contacts, prior_log_c(model)
+    draw = (contacts if recipe.load == "contacts" else smooth)(recipe, index, recipe.priors[index % len(recipe.priors)])
+    problem, log_c = with_gaps(draw.problem, generator_of(recipe, 10_000_019 + index)), prior_log_c(draw.problem)
     rows = []
-    for i in torch.arange(len(markers.positions)).split(CHUNK):
-        part = markers.take(i)
-        x = answered(model, part, noise, draw.gamma[i], recipe.target_iterations)
-        target, M = in_order(x[:, :size], information(model, part, noise, x, size))
-        read = features(model, part, noise)
+    for i in torch.arange(problem.batch).split(CHUNK):
+        part = problem.take(i)
+        x = answered(part, draw.gamma[i], recipe.target_iterations)
+        target, M = in_order(x[:, part.state.loads.at], information(part, x))
+        read = features(part)
         turn = turn_of_gamma(read.turn, recipe.contacts)
         target, M = (turn @ target.unsqueeze(-1)).squeeze(-1), turn @ M @ turn.mT
         good = torch.isfinite(target).all(-1) & torch.isfinite(M).flatten(1).all(-1)
