@@ -58,14 +58,14 @@ def test_dialects_read_alike(tmp_path_factory, mark, comma, upper, end, remarks,
         lines.insert(min(2 * i, len(lines)), remark)
     shapes = shapes_of(end.join(lines), folder)
     assert shapes.samples == [name]
-    assert torch.equal(shapes.markers.positions, torch.tensor([[row[1:] for row in GOOD]], dtype=torch.float64))
-    assert shapes.markers.s.tolist() == [row[0] for row in GOOD]
+    assert torch.equal(shapes.positions, torch.tensor([[row[1:] for row in GOOD]], dtype=torch.float64))
+    assert shapes.s.tolist() == [row[0] for row in GOOD]
 
 
 def test_the_header_may_be_a_remark(tmp_path):
     """As numpy.savetxt writes it."""
     np.savetxt(tmp_path / "shapes.csv", GOOD, delimiter=",", header="s,x,y,z")
-    assert read_shapes(tmp_path / "shapes.csv", steel_rod()).markers.s.tolist() == pytest.approx([row[0] for row in GOOD])
+    assert read_shapes(tmp_path / "shapes.csv", steel_rod()).s.tolist() == pytest.approx([row[0] for row in GOOD])
     with pytest.raises(InputError, match="line 6, column x: 'q' is not a number"):
         shapes_of("# remark\ns,x,y,z\n#\n0.1,0,0,0.1\n\n0.2,q,0,0\n", tmp_path)
 
@@ -79,16 +79,16 @@ def test_what_is_written_is_read(tmp_path_factory, names, data):
     numbers = st.floats(-0.4, 0.4).filter(bool) | st.just(math.nan)
     cells = st.lists(numbers, min_size=3 * len(s), max_size=3 * len(s))
     positions = torch.tensor([data.draw(cells) for _ in names], dtype=torch.float64).reshape(len(names), len(s), 3)
-    write_shapes(path, Shapes(Markers(s, positions), names))
+    write_shapes(path, Shapes(s, positions, names))
     back = read_shapes(path, steel_rod())
     assert back.samples == names
-    assert torch.equal(back.markers.s, s)
-    assert torch.equal(back.markers.positions.nan_to_num(9.0), positions.nan_to_num(9.0))
+    assert torch.equal(back.s, s)
+    assert torch.equal(back.positions.nan_to_num(9.0), positions.nan_to_num(9.0))
 
 
 def test_a_name_for_every_sample(tmp_path):
     with pytest.raises(InputError, match="1 names for 2 samples"):
-        write_shapes(tmp_path / "s.csv", Shapes(Markers(torch.tensor([0.1, 0.2]), torch.zeros(2, 2, 3)), ["0"]))
+        write_shapes(tmp_path / "s.csv", Shapes(torch.tensor([0.1, 0.2]), torch.zeros(2, 2, 3), ["0"]))
 
 
 def test_zeros_are_gaps(tmp_path, capsys):
@@ -98,12 +98,12 @@ def test_zeros_are_gaps(tmp_path, capsys):
     text = "\n".join(["sample,s,x,y,z", "a,0,0,0,0", *rows])
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        markers = shapes_of(text, tmp_path).markers
+        markers = shapes_of(text, tmp_path).markers(1e-3)
     assert len(said) == 1
     assert "exactly (0, 0, 0), 2 in 2 of 2 samples (s = 200, 300 mm), are taken as missing" in str(said[0].message)
     assert markers.present[0].tolist() == [True, True, False, True, True]
     assert markers.present[1].tolist() == [False, True, True, False, True]
-    zeroed = Markers(markers.s[1:], torch.zeros(1, 4, 3))
+    zeroed = Markers(markers.s[1:], torch.zeros(1, 4, 3), 1e-3)
     assert "at exactly (0, 0, 0)" in misplaced(zeroed, 0, 0.4)
 
 
@@ -136,7 +136,7 @@ def test_a_coil_is_not_misplaced(turns, radius, count):
     tangent = torch.tensor([0.0, c, a * k])  # turned so that it begins along +z
     turn = torch.tensor([[1.0, 0, 0], [0, a * k, -c], [0, c, a * k]])
     assert (turn @ tangent - torch.tensor([0.0, 0, 1])).abs().max() < 1e-9
-    assert misplaced(Markers(s, (z @ turn.T)[None]), 0, L) == ""
+    assert misplaced(Markers(s, (z @ turn.T)[None], 1e-3), 0, L) == ""
 
 
 def two_tendons(offset: float = 0.0) -> Robot:
@@ -151,8 +151,8 @@ def test_slack_load_cells(tmp_path):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             shapes = shapes_of("\n".join(["sample,s,x,y,z,tension_1,tension_2", *rows]), tmp_path, two_tendons(offset))
-        assert shapes.markers.tension is not None
-        assert shapes.markers.tension.tolist() == [list(p) for p in pulls]
+        assert shapes.tension is not None
+        assert shapes.tension.tolist() == [list(p) for p in pulls]
         return [str(w.message) for w in said]
 
     (said,) = read([(1.0, 2.0), (-0.3, 2.0), (1.0, -0.01), (1.0, 1.0)])
@@ -210,7 +210,7 @@ def test_a_modulus_in_megapascals_is_told(tmp_path):
         (lambda: Tendon(((0.1, 0, 0), (0.1, 0, 0)), 0.4), "s must increase"),
         (lambda: Tendon.straight(0.01, 0, -0.4), "ends at -0.4 m"),
         (lambda: Tendon.straight(0.01, 0, 0.4, math.inf), "tension_offset is inf"),
-        (lambda: Markers(torch.tensor([0.1]), torch.zeros(1, 1, 3) + 0j), "Markers.positions is complex"),
+        (lambda: Markers(torch.tensor([0.1]), torch.zeros(1, 1, 3) + 0j, 1e-3), "Markers.positions is complex"),
     ],
 )
 def test_what_is_no_robot(make, words):

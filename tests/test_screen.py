@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests.robots import steel_rod
+from tests.problems import posed
 from tests.study import study1
-from torchrod import GaussianCoordinates, Markers, Model, estimate, write_result
+from torchrod import estimate, write_result
 from torchrod.analysis.diagnosis import diagnose
 from torchrod.cli import main, table
 from torchrod.cli.parser import COMMANDS
@@ -164,16 +164,14 @@ def fitted():
     torch.set_default_dtype(torch.float64)
     study = study1(120)
     torch.manual_seed(0)
-    model, markers = (
-        Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0)),
-        Markers(study.s, study.positions + 2e-3 * torch.randn(120, 20, 3)),
-    )
-    fit = estimate(model, markers, 2e-4)  # less noise than there is: none is accepted
-    return model, markers, fit, diagnose([(model, torch.arange(120))], markers, 1e-3, replace(fit, accepted=fit.accepted | True))
+    positions = study.positions + 2e-3 * torch.randn(120, 20, 3)
+    problem = posed(study.s, positions, 2e-4)  # less noise than there is: none is accepted
+    fit = estimate(problem)
+    return problem, fit, diagnose(problem, replace(fit, accepted=fit.accepted | True))
 
 
 def test_a_long_table_is_cut_on_a_terminal_only(fitted, monkeypatch):
-    _, _, fit, quiet = fitted
+    _, fit, quiet = fitted
     names = [str(b) for b in range(120)]
     whole = table.table(fit, names, quiet, None).splitlines()
     assert len(whole) == 242
@@ -197,22 +195,22 @@ def test_a_result_needs_a_name_for_every_sample(fitted, tmp_path):
     for suffix in (".json", ".npz"):
         for names in (["a"], ["a"] * 121):
             with pytest.raises(InputError, match=f"{len(names)} names for 120 samples"):
-                write_result(tmp_path / f"r{suffix}", fitted[2], names, "rod")
+                write_result(tmp_path / f"r{suffix}", fitted[1], names, "rod")
     assert not list(tmp_path.iterdir())
 
 
 def test_table_and_records_are_linear_in_the_samples(fitted, tmp_path, monkeypatch):
     """What a result works out for its whole batch is asked for once, whatever the number of samples."""
     asked: list[str] = []
-    cls = type(fitted[2])
+    cls = type(fitted[1])
     for name in ("magnitude", "magnitude_location_covariance", "rms_residual", "location_interval"):
         inner = getattr(cls, name).fget
         monkeypatch.setattr(cls, name, property(lambda self, inner=inner, name=name: (asked.append(name), inner(self))[1]))
     counts = []
     for write in (
-        lambda: table.table(fitted[2], ["a"] * 120, fitted[3], None),
-        lambda: write_result(tmp_path / "r.json", fitted[2], ["a"] * 120, "rod", diagnosis=fitted[3]),
-        lambda: write_result(tmp_path / "r.npz", fitted[2], ["a"] * 120, "rod", diagnosis=fitted[3]),
+        lambda: table.table(fitted[1], ["a"] * 120, fitted[2], None),
+        lambda: write_result(tmp_path / "r.json", fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2]),
+        lambda: write_result(tmp_path / "r.npz", fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2]),
     ):
         asked.clear()
         write()
@@ -311,11 +309,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 
 def test_features_of_gaps_are_nearly_those_without(fitted):
     """One marker of twenty left out changes little, and the batch decides nothing."""
-    model, markers, _, _ = fitted
+    markers = fitted[0].markers
     positions = markers.positions.clone()
     positions[::2, 7] = torch.nan
-    gaps = features(model, replace(markers, positions=positions), 1e-3)
-    alone = features(model, Markers(markers.s, positions[:1]), 1e-3)
-    whole = features(model, markers, 1e-3)
+    gaps, alone, whole = (features(posed(markers.s, p)) for p in (positions, positions[:1], markers.positions))
     assert (gaps.amp / whole.amp - 1).abs().max() < 0.2
     assert torch.allclose(gaps.x[:1], alone.x, atol=1e-9)

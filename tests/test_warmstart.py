@@ -410,7 +410,7 @@ assert not [name for name in sys.modules if name.startswith(("lightning.", "pyto
 
 @pytest.mark.parametrize("missing", [False, True])
 def test_the_costs_of_a_guess_are_the_models(missing):
-    """They come from the forward solves; challenged_by_cold would otherwise evaluate the model. Also with noise of each sample's."""
+    """They come from the forward solves; challenged_by_cold would else evaluate the model. Also with noise of each sample's."""
     markers, _ = noisy(20)
     markers = replace(markers, noise=torch.linspace(0.5e-3, 2e-3, 20))
     if missing:
