@@ -160,5 +160,7 @@ def _actuated(
         status,
         shape.residual,
         shape.iterations,
+        shape.stable & ~failed,
+        shape.resolved,
     )
     return Actuated(equilibrium, kept(tension), tension <= 0, kept(path))
