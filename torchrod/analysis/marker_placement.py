@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.robot import Robot
 from ..util.precision import DTYPE
 from .observability import around, check, covariance, held, places, push_model, pushed, seen_by, sensitivity
@@ -75,7 +74,7 @@ def _information(
     tension: Float[Tensor, " T"] | None,
     registration: bool,
     directions: int,
-    steps: int,
+    steps: int | None,
 ) -> tuple[Float[Tensor, "C B m m"], Float[Tensor, "m m"]]:
     """A_i of (1) for every candidate and push, and `held`. Pushes without an equilibrium are left out."""
     model = push_model(robot, registration, steps)
@@ -124,7 +123,7 @@ def place(
     nearest: float | None = None,
     gap: float | None = None,
     directions: int = 8,
-    steps: int = DEFAULT_STEPS,
+    steps: int | None = None,
 ) -> Placement:
     """Propose `count` markers for pushes of `force` (N) from `nearest` (m; 10 % of L) to the tip, in every direction.
 

@@ -18,10 +18,10 @@ from scipy.optimize import brentq
 from scipy.special import chdtri, chndtr
 from torch import Tensor
 
-from ..mechanics.grid import DEFAULT_STEPS, on_rod
+from ..mechanics.grid import on_rod
 from ..mechanics.loads import PointForces
 from ..mechanics.robot import Robot
-from ..mechanics.statics import solve_shape
+from ..mechanics.statics import solve_shape, steps_for
 from ..model.load_families import GaussianCoordinates
 from ..model.measurement import Markers, Model
 from ..util.precision import DTYPE, as_float64
@@ -55,9 +55,10 @@ class Observability:
 
 
 def push_model(
-    robot: Robot, registration: bool = False, steps: int = DEFAULT_STEPS, frame_std: tuple[float, float] | None = None
+    robot: Robot, registration: bool = False, steps: int | None = None, frame_std: tuple[float, float] | None = None
 ) -> Model:
-    """The estimator's model of one contact, without a prior on it."""
+    """The estimator's model of one contact, without a prior on it. steps: None takes as many as the unloaded rod needs."""
+    steps = steps or steps_for(robot, robot.gravity.new_tensor([robot.rod.length]))
     loads = GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale, "none")
     return Model(robot, loads, registration, steps=steps, frame_std=frame_std)
 
@@ -146,7 +147,7 @@ def load_bound(
     noise: float,
     registration: bool = False,
     width_known: bool = True,
-    steps: int = DEFAULT_STEPS,
+    steps: int | None = None,
     frame_std: tuple[float, float] | None = None,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, by (1).
@@ -227,7 +228,7 @@ def bounds(
     registration: bool = False,
     width_known: bool = True,
     directions: int = 8,
-    steps: int = DEFAULT_STEPS,
+    steps: int | None = None,
 ) -> Observability:
     """What markers at s (m) with this noise (m) see of a push at every place (m; 60 from 2 % of L to the tip) and direction.
 

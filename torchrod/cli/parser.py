@@ -108,6 +108,7 @@ def _simulate_parser() -> ArgumentParser:
     _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to every coordinate (m)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--steps", type=int, default=None, help="arc-length steps, instead of as many as 0.005 mm per m take")
     parser.add_argument("--out", type=str, required=True, help="SHAPE.csv")
     return parser
 

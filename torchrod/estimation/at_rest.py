@@ -16,6 +16,8 @@ from ..model.measurement import Markers, Model
 from ..util.kept import versions
 from .evaluator import Prepared, family_of, served
 
+HEAVY = 7.0  # in EI / L^3: the weight under which an upright rod buckles is 7.84
+
 
 @dataclass(frozen=True)
 class Rest:
@@ -29,13 +31,15 @@ def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: 
     """The base wrench and the shape at markers.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
 
     q_tip: the orientation of the tip near which to look, where it is known: sooner found. By the compiled kernel where it serves;
-    what does not settle there, and all else, by torchrod.solve_shape, which is the definition.
+    what does not settle there, rods so heavy that an upright one would fall over, and all else, by torchrod.solve_shape, which is the
+    definition and stays in stable equilibrium.
     """
     B, P = len(gamma), len(markers.s)
     rough = replace(model.coarse, registration=False, tip="none", tension_std=None)
     wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
     settled = torch.zeros(B, dtype=torch.bool)
-    if family_of(rough) != "point" and model.robot.gravity.ndim == 1 and served(rough, markers.positions):
+    light = model.robot.gravity.ndim == 1 and math.isfinite(_weight(model))
+    if light and family_of(rough) != "point" and served(rough, markers.positions):
         x = rough.join(gamma, wrench.new_zeros(B, 6))
         tables = Prepared(rough, markers, gamma.new_zeros(B, 0)).tables(x)
         wrench, missed, p = kernel.balance_now(
@@ -73,7 +77,13 @@ def _kept_bare(robot: Robot, steps: int, s: Float[Tensor, " P"], now: tuple[int,
     return _bare(robot, steps, Markers(s, s.new_zeros(1, len(s), 3)))
 
 
+def _weight(model: Model) -> float:
+    """In EI / L^3; infinite where the rod has no stiffness to speak of."""
+    rod = model.robot.rod
+    load = float(model.robot.weight.norm()) * rod.length**3
+    return load / rod.bending_stiffness if load < HEAVY * rod.bending_stiffness else math.inf
+
+
 def _increments(model: Model) -> int:
     """In how many parts the weight is put on, so that each is no more than solve_shape's."""
-    rod, weight = model.robot.rod, model.robot.weight
-    return max(1, math.ceil(float(weight.norm()) * rod.length**3 / rod.bending_stiffness / LOAD_PER_INCREMENT))
+    return max(1, math.ceil(_weight(model) / LOAD_PER_INCREMENT))

@@ -37,6 +37,7 @@ FINE_WAVE, FINE_TURN = 0.1, 0.2  # rad per step: loads below are followed to STE
 SAMPLE_STEPS = 40_000  # solved at once on finer grids: what bounds the memory
 LEAST_PIECES, MOST_PIECES = 6, 400
 UNSOLVED_FINER = 4  # times as many steps are tried once for what was not solved
+PER_SAMPLE = ("p", "q", "base_wrench", "status", "residual", "iterations", "stable", "resolved")  # of Equilibrium
 KEPT_STEPS = 256  # robots and marker layouts
 
 
@@ -157,6 +158,10 @@ class Equilibrium:
     iterations: Int[Tensor, " B"]
     stable: Bool[Tensor, " B"]
     resolved: Bool[Tensor, " B"]
+
+    def take(self, index: Tensor) -> "Equilibrium":
+        """The samples of an index or a mask."""
+        return replace(self, **{name: getattr(self, name)[index] for name in PER_SAMPLE})
 
     @property
     def only_unstable(self) -> Bool[Tensor, " B"]:
@@ -284,6 +289,15 @@ def steps_for(
         return _refined(robot, loads, tension, answer, first, ORIENTATION_TOLERANCE, False)[1]
 
 
+def needs_finer(
+    robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "B T"] | None, outputs: Float[Tensor, " P"], batch: int, steps: int
+) -> Bool[Tensor, " B"]:
+    """Samples whose loads so many steps might not follow to STEP_TOLERANCE; steps_for tells."""
+    with torch.no_grad():
+        table = _problem(robot, loads, tension, outputs, batch, steps).table
+        return ~_Sizes.of(table, robot.rod.length, batch).fine(robot, tension, steps)
+
+
 _steps_kept: dict[tuple[object, ...], int] = {}
 
 
@@ -366,7 +380,7 @@ def _halved(
         fails = finer.equilibrium.status != int(Status.CONVERGED)
         kept = (error <= allowed) | (fails & (not started))
         better = ~kept & ((error / 16 <= allowed / 4) & (error <= 1e-2 * robot.rod.length))
-        found = _put(found, finer.equilibrium, index, ~kept)
+        found = replaced(found, finer.equilibrium.take(~kept), index[~kept])
         most = max(most, n if bool(kept.all()) else m)
         more = (~kept & ~better).nonzero().squeeze(-1)
         if len(more) and 2 * m <= MOST_STEPS:
@@ -391,23 +405,15 @@ def _solve_some(
     B, some = len(found.status), taken(loads, index)
     if some is None and len(index) < B:
         whole = _solve(robot, loads, tension, found.s, B, steps, tolerance, None, gradients)
-        every = _every(whole.equilibrium, lambda x: x[index])
-        return _Solved(every, whole.q_tip[index], whole.sure[index])
+        return _Solved(whole.equilibrium.take(index), whole.q_tip[index], whole.sure[index])
     part = replace(robot, gravity=robot.gravity[index]) if robot.gravity.ndim > 1 and len(robot.gravity) == B else robot
     own = tension[index] if tension is not None and len(tension) == B else tension
     return _solve(part, loads if some is None else some, own, found.s, len(index), steps, tolerance, q_tip, gradients)
 
 
-def _every(e: Equilibrium, function) -> Equilibrium:
-    names = ("p", "q", "base_wrench", "status", "residual", "iterations", "stable", "resolved")
-    return replace(e, **{name: function(getattr(e, name)) for name in names})
-
-
-def _put(e: Equilibrium, new: Equilibrium, index: Int[Tensor, " b"], where: Bool[Tensor, " b"]) -> Equilibrium:
-    """e with the samples of an index replaced where it says so."""
-    rows = index[where]
-    names = ("p", "q", "base_wrench", "status", "residual", "iterations", "stable", "resolved")
-    return replace(e, **{n: getattr(e, n).index_copy(0, rows, getattr(new, n)[where]) for n in names})
+def replaced(e: Equilibrium, new: Equilibrium, index: Int[Tensor, " b"]) -> Equilibrium:
+    """e with other answers for the samples of an index."""
+    return replace(e, **{n: getattr(e, n).index_copy(0, index, getattr(new, n)) for n in PER_SAMPLE})
 
 
 def _unresolved(e: Equilibrium, index: Int[Tensor, " b"]) -> Equilibrium:
