@@ -31,8 +31,8 @@ def at_rest(model: Model, markers: Markers, gamma: Float[Tensor, "B g"], q_tip: 
     """The base wrench and the shape at markers.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
 
     q_tip: the orientation of the tip near which to look, where it is known: sooner found. By the compiled kernel where it serves;
-    what does not settle there, rods so heavy that an upright one would fall over, and all else, by torchrod.solve_shape, which is the
-    definition and stays in stable equilibrium.
+    what does not settle there, rods so heavy that an upright one would fall over, and all else, by torchrod.solve_shape, which is
+    the definition and stays in stable equilibrium.
     """
     B, P = len(gamma), len(markers.s)
     rough = replace(model.coarse, registration=False, tip="none", tension_std=None)

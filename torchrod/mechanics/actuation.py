@@ -6,8 +6,8 @@ It cannot push, so that with l(tau) the length of its path in equilibrium
     (1)  0 <= tau,   0 <= A - l(tau),   tau (A - l(tau)) = 0        (taut with some tension, or slack with none)
 
 for all tendons together, a complementarity problem. Newton's method of Josephy: (1) is solved exactly with the gap A - l linearized
-in tau, by principal pivoting, so that which tendons are taut is decided for all of them at once; a step that does not lower the worst
-violation of (1) is halved. Antagonists pulled and paid out by the same length are taut or slack by micrometres.
+in tau, by principal pivoting, so that which tendons are taut is decided for all of them at once; a step that does not lower the
+worst violation of (1) is halved. Antagonists pulled and paid out by the same length are taut or slack by micrometres.
 Source: Facchinei & Pang, Finite-Dimensional Variational Inequalities and Complementarity Problems, 2003, sec. 7.3 (the method);
 K. G. Murty, Opsearch 11, 1974 (least-index principal pivoting).
 """
@@ -180,7 +180,7 @@ def _slope(solved, tension: Float[Tensor, "B T"], gap: Float[Tensor, "B T"], by:
 def _complementary(
     slope: Float[Tensor, "B T T"], gap: Float[Tensor, "B T"], tension: Float[Tensor, "B T"], k: Float[Tensor, " T"]
 ) -> Float[Tensor, "B T"]:
-    """tau >= 0 with gap + slope (tau - tension) >= 0 and their product zero: least-index principal pivoting from what seems taut."""
+    """tau >= 0 with gap + slope (tau - tension) >= 0 and their product zero: least-index pivoting from what seems taut."""
     eye = torch.eye(tension.shape[-1], dtype=tension.dtype)
     S = slope.nan_to_num(0.0)
     S = S + FREE * S.abs().amax((-2, -1))[:, None, None] * eye

@@ -76,7 +76,8 @@ def make_grid(
     """Nodes at 0, L, the outputs, the ends (of tendons, of pieces of the reference curvature) and the breakpoints.
 
     Filled up so that no step is longer than L / steps (m), nor turns the unloaded rod by more than TURN_OF_ALL / steps (rad).
-    curvature: u* (1/m) at s on the side of `inside`, linear between the ends. Errors: ValueError for outputs that do not lie on the rod.
+    curvature: u* (1/m) at s on the side of `inside`, linear between the ends. Errors: ValueError for outputs that do not lie on the
+    rod.
     """
     if not bool(on_rod(outputs, length).all()):
         raise ValueError(f"outputs run from {float(outputs.min())} to {float(outputs.max())} m, outside the rod of 0 to {length} m")

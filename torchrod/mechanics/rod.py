@@ -63,7 +63,7 @@ class Rod(Float64):
     @property
     def bending_stiffness(self) -> float:
         """EI (N m^2): the geometric mean of the two bending stiffnesses, the rod's scale of stiffness."""
-        return kept(self, "_bending_stiffness", self.K_bt, lambda K_bt: float((K_bt[0, 0] * K_bt[1, 1]).sqrt()))
+        return kept(self, "_bending_stiffness", self.K_bt, lambda K_bt: float((K_bt[0, 0] * K_bt[1, 1]).detach().sqrt()))
 
     @property
     def force_scale(self) -> float:

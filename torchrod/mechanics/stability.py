@@ -1,20 +1,20 @@
 """Which equilibria a rod can be seen in, and how to stay on them while the load is put on.
 
-March from tip to base and turn the tip a little: every section turns by Theta(s) w, and the wrench beyond the tip stays what it is, so
-these are the equilibria of the rod from s to its tip nearest to the one at hand.
+March from tip to base and turn the tip a little: every section turns by Theta(s) w, and the wrench beyond the tip stays what it is,
+so these are the equilibria of the rod from s to its tip nearest to the one at hand.
 
-(1) s is conjugate to the tip where det Theta(s) = 0: the part beyond s, clamped there, then has a second equilibrium at no distance.
-(2) The second variation of the total potential energy has as many negative directions as there are conjugate points between base and
-    tip, each as often as the rank is lost (Morse's index theorem; R. S. Manning, K. A. Rogers & J. H. Maddocks, Proc. R. Soc. A 454,
-    1998, for rods). None: a strict minimum, the rod rests there. Any: it leaves at the least touch.
-(3) From one node to the next Theta is multiplied by I - h K^-1 P with P symmetric but for terms that vanish with h, so its eigenvalues
-    are real, and every negative one is a conjugate point in the step. Two at once, as in a round column, are both counted.
-(4) Without conjugate points for sure (and with one equilibrium only) where, with the least stiffness K,
-        (2 L / pi)^2 |n| + (2 L / pi) |m| < K        by Poincare's inequality in the second variation, int K |th'|^2 - m.. - n..
+(1) s is conjugate to the tip where det Theta(s) = 0: the part beyond s, clamped there, has a second equilibrium at no distance.
+(2) The second variation of the total potential energy has as many negative directions as there are conjugate points between
+    base and tip, each as often as the rank is lost (Morse's index theorem; for rods R. S. Manning, K. A. Rogers &
+    J. H. Maddocks, Proc. R. Soc. A 454, 1998). None: a strict minimum, the rod rests there. Any: it leaves at the least touch.
+(3) From one node to the next Theta is multiplied by I - h K^-1 P with P symmetric but for terms that vanish with h, so its
+    eigenvalues are real, and every negative one is a conjugate point in the step. Two at once, as in a round column, both count.
+(4) There is none for sure where, with the least stiffness K and n, m the most that a section carries,
+        (2 L / pi)^2 |n| + (2 L / pi) |m| < K        by Poincare's inequality in the second variation.
 
-The energy is that of loads that keep their direction in the base frame, of weight and of tendons. A load that turns with the section
-and a dead moment have none: there (1) still says where equilibria meet and part, and the count is that of divergence; flutter is not
-looked for.
+The energy is that of loads that keep their direction in the base frame, of weight and of tendons. A load that turns with the
+section and a dead moment have none: there (1) still says where equilibria meet and part, and the count is that of divergence;
+flutter is not looked for.
 """
 
 import math
@@ -65,8 +65,8 @@ def follow(
 
     q: the tip without them. increments: in how many steps at least. unique_below: the fraction of the load up to which (4) holds.
     mine: which samples are asked for. pieces: into which the rod is cut to count.
-    An increment counts when Newton settles, nothing is conjugate, and the tip has turned no further than it should; else it is halved.
-    Where that ends, another branch is looked for just beyond (`_escape`).
+    An increment counts when Newton settles, nothing is conjugate, and the tip has turned no further than it should; else it is
+    halved. Where that ends, another branch is looked for just beyond (`_escape`).
     Returns q, the residual (rad), the iterations and whether it is stable; where it is not, q is Newton's own from there.
     """
     most = 1 / increments.to(q.dtype)
@@ -124,9 +124,9 @@ def _escape(
 ) -> tuple[Float[Tensor, " 4"], float, float] | None:
     """A stable equilibrium of sample b beyond the fraction `done` of the load, where its own branch ends, nearest to q.
 
-    Newton from tips turned both ways along the modes of Theta(0), and from orientations all round. Of two that are as near, as where
-    a straight column buckles, the one whose tip has gone the way of `_direction`. Returns q, the fraction and the residual; None
-    where there is none.
+    Newton from tips turned both ways along the modes of Theta(0), and from orientations all round. Of two that are as near, as
+    where a straight column buckles, the one whose tip has gone the way of `_direction`. Returns q, the fraction and the residual;
+    None where there is none.
     """
     one = torch.tensor([b])
     Theta, tip_moves = problem.take(one).turns(q.unsqueeze(0), torch.full((1,), done, dtype=q.dtype), pieces)

@@ -171,7 +171,7 @@ class Equilibrium:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """The largest force (N) and moment (N m) at any section, per sample: of loads that keep their direction, and that turn with it."""
+    """The largest force (N) and moment (N m) at any section, per sample: of loads that keep their direction, and of the others."""
 
     dead_force: Float[Tensor, " B"]
     dead_moment: Float[Tensor, " B"]
@@ -179,16 +179,17 @@ class _Sizes:
     moment: Float[Tensor, " B"]
 
     @classmethod
-    def of(cls, table: StageTable, length: float, B: int) -> "_Sizes":
+    def of(cls, problem: TipProblem, length: float) -> "_Sizes":
         """From the integrals of the loads; a force at most L away makes a moment."""
-        zero = torch.zeros(B, dtype=table.u_star.dtype)
+        loads, zero = problem.table.loads, torch.zeros(len(problem.wrench), dtype=problem.wrench.dtype)
+        N, M = problem.wrench.detach().split(3, -1)
 
         def largest(x: Vector | None) -> Float[Tensor, " B"]:
             return zero if x is None else zero + x.detach().norm(dim=-1).flatten(-2).amax(-1)
 
-        loads = table.loads
-        n, m, G = largest(loads.Wn), largest(loads.Wm), largest(loads.G)
-        return cls(n, n * length + m, G, G * length + largest(loads.Gm))
+        n, m = largest(loads.Wn), largest(loads.Wm)
+        G = largest(N[:, None, None, :] if loads.G is None else N[:, None, None, :] - loads.G)  # what lies beyond a section
+        return cls(n, n * length + m, G, torch.maximum(G * length + largest(loads.Gm), M.norm(dim=-1)))
 
     def in_units(self, robot: Robot) -> Float[Tensor, " B"]:
         """Loads of the base frame, in EI / L^2."""
@@ -197,7 +198,7 @@ class _Sizes:
         return ((n * L * L + m * L) / EI).nan_to_num(0.0, torch.inf)
 
     def unique_below(self, robot: Robot) -> Float[Tensor, " B"]:
-        """The fraction of the base frame's loads up to which there is one equilibrium, and a stable one: (4) of mechanics.stability."""
+        """The fraction of the base frame's loads up to which (4) of mechanics.stability holds."""
         a, K = POINCARE * robot.rod.length, robot.rod.softest
         dead, local = a * (a * self.dead_force + self.dead_moment), a * (a * self.force + self.moment)
         return ((K - local) / dead.clamp(min=1e-300)).clamp(min=0.0)
@@ -235,7 +236,9 @@ def _tensors(robot: Robot, loads: tuple[Load, ...], *more: Tensor | None) -> lis
 def _asked_for_gradients(tensors: list[Tensor]) -> bool:
     """Whether autograd is to see the solve. Errors: InputError for torch.func and forward mode, which it has no rule for."""
     if any(debug_unwrap(x) is not x or forward_ad.unpack_dual(x).tangent is not None for x in tensors):
-        raise InputError("solve_shape has no torch.func transform and no forward mode; call backward or torch.autograd.grad instead")
+        raise InputError(
+            "solve_shape has no torch.func transform and no forward mode; call backward or torch.autograd.grad instead"
+        )
     return torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
 
 
@@ -253,9 +256,9 @@ def solve_shape(
 
     Marches tip to base and turns the tip until the base sits in its clamp, R(0) = I: at once without base-frame loads, by damped
     Newton on three numbers with them, until the base misses it by less than the tolerance (rad). The base frame's loads are put on
-    in increments, on the branch of stable equilibria that begins without load, and where that ends on another (mechanics.stability).
-    Loads (B, ...) in their own frames and units (mechanics.loads), tension N, outputs m. q_tip: where to look for the tip's
-    orientation, with all of the load at once.
+    in increments, on the branch of stable equilibria that begins without load, and where that ends on another
+    (mechanics.stability). Loads (B, ...) in their own frames and units (mechanics.loads), tension N, outputs m. q_tip: where to
+    look for the tip's orientation, with all of the load at once.
     steps: None takes as many as leave less than STEP_TOLERANCE of L in every place; a number takes these, whatever they leave.
     Where an input requires grad, first derivatives of the answer are exact (implicit function theorem, torch path).
     Errors: ValueError for outputs off the rod, InputError under transforms of torch.func. A sample that cannot be solved has status
@@ -278,7 +281,8 @@ def steps_for(
     loads: tuple[Load, ...] = (),
     batch: int = 1,
 ) -> int:
-    """The least number of steps that leaves less than STEP_TOLERANCE of L in every place, at outputs (m), for all of `batch` samples.
+    """The least number of steps that leaves less than STEP_TOLERANCE of L in every place, at outputs (m), for all of `batch`
+    samples.
 
     Without loads and tensions it is worked out once for a robot and its outputs, and kept by their values.
     """
@@ -290,12 +294,17 @@ def steps_for(
 
 
 def needs_finer(
-    robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "B T"] | None, outputs: Float[Tensor, " P"], batch: int, steps: int
+    robot: Robot,
+    loads: tuple[Load, ...],
+    tension: Float[Tensor, "B T"] | None,
+    outputs: Float[Tensor, " P"],
+    batch: int,
+    steps: int,
 ) -> Bool[Tensor, " B"]:
     """Samples whose loads so many steps might not follow to STEP_TOLERANCE; steps_for tells."""
     with torch.no_grad():
-        table = _problem(robot, loads, tension, outputs, batch, steps).table
-        return ~_Sizes.of(table, robot.rod.length, batch).fine(robot, tension, steps)
+        problem = _problem(robot, loads, tension, outputs, batch, steps)
+        return ~_Sizes.of(problem, robot.rod.length).fine(robot, tension, steps)
 
 
 _steps_kept: dict[tuple[object, ...], int] = {}
@@ -468,7 +477,7 @@ def _solve(
     whole = _problem(robot, loads, tension, outputs, B, steps)
     with torch.no_grad():
         problem = _detached(whole) if gradients else whole
-        sizes = _Sizes.of(problem.table, robot.rod.length, B)
+        sizes = _Sizes.of(problem, robot.rod.length)
         q, one = identity_quaternion((B,), problem.wrench[:, :3]), torch.ones_like(problem.wrench[:, 0])
         dead = problem.table.loads.Wn is not None or problem.table.loads.Wm is not None
         if q_tip is None or not dead:
@@ -486,7 +495,9 @@ def _solve(
             else:
                 q, residual, iterations = newton(problem, q_tip, one, tolerance * one)
                 stable = _stable(problem, q, unique, sizes.pieces(robot))
-    equilibrium = _equilibrium(whole, problem, q, residual, iterations, stable, valid if dead else None, outputs, tolerance, gradients)
+    equilibrium = _equilibrium(
+        whole, problem, q, residual, iterations, stable, valid if dead else None, outputs, tolerance, gradients
+    )
     sure = sizes.fine(robot, tension, steps)
     return _Solved(equilibrium, q, sure)
 
@@ -517,16 +528,17 @@ def stable_at(
         problem = _problem(robot, loads, tension, outputs, len(q_tip), steps)
         if problem.table.loads.Wn is None and problem.table.loads.Wm is None:
             return torch.ones(len(q_tip), dtype=torch.bool)
-        sizes = _Sizes.of(problem.table, robot.rod.length, len(q_tip))
+        sizes = _Sizes.of(problem, robot.rod.length)
         return _stable(problem, q_tip, sizes.unique_below(robot), sizes.pieces(robot))
 
 
 def _marched(whole: TipProblem, problem: TipProblem, q_tip: Quaternion) -> Float[Tensor, "B P1 13"]:
     """The states at the outputs and the base, with their first derivatives.
 
-    The tip's orientation solves r(q, theta) = 0, so that dq = -J^-1 dr: one more Newton step from the solution, J held, has just that.
+    The tip's orientation solves r(q, theta) = 0, so that dq = -J^-1 dr: one more Newton step from the solution, J held, has just
+    that.
     """
-    r, J = problem.base(q_tip, turning(q_tip), torch.ones_like(q_tip[:, 0]))
+    _, J = problem.base(q_tip, turning(q_tip), torch.ones_like(q_tip[:, 0]))
     at, J_inverse = whole.grid.outputs_and_base, inverse3(J)
 
     def states(q: Quaternion) -> Float[Tensor, "B P1 13"]:

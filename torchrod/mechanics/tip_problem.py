@@ -1,7 +1,7 @@
 """The rod marched from its tip to its base: which orientation of the tip lets the base sit in its clamp.
 
-Beyond the tip there is nothing, so the wrench is known there and only the tip's orientation is unknown: three numbers. r, the rotation
-vector by which the base misses the identity, must vanish; damped Newton finds where.
+Beyond the tip there is nothing, so the wrench is known there and only the tip's orientation is unknown: three numbers. r, the
+rotation vector by which the base misses the identity, must vanish; damped Newton finds where.
 """
 
 from dataclasses import dataclass, replace
@@ -85,7 +85,7 @@ def turning(q: Float[Tensor, "B 4"]) -> Float[Tensor, "B 4 3"]:
 def newton(
     problem: TipProblem, q: Quaternion, fraction: Float[Tensor, " B"], enough: Float[Tensor, " B"], most: int = MAX_NEWTON
 ) -> tuple[Quaternion, Float[Tensor, " B"], Int[Tensor, " B"]]:
-    """Damped Newton on the tip's orientation until it is good enough (rad): the best one, its residual (rad), the iterations taken."""
+    """Damped Newton on the tip's orientation until it is good enough (rad): the best one, its residual (rad), the iterations."""
     best = torch.full_like(fraction, torch.inf)
     anchor, turn, damping = q, torch.zeros_like(q[..., :3]), torch.ones_like(best)
     iterations = torch.zeros(best.shape, dtype=torch.int64)
