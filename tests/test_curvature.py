@@ -141,7 +141,7 @@ def wrenches(count: int) -> list:
     rng = np.random.default_rng(7)
     found = []
     for i in range(count):
-        size = 10 ** rng.uniform(-1, 2.5)
+        size = 10 ** rng.uniform(-1, 2)
         way = rng.standard_normal(3)
         way /= np.linalg.norm(way)
         zero, push, s = torch.zeros(1, 1, 3), T((size * way).tolist()).reshape(1, 1, 3), T([0.4])
