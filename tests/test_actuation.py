@@ -62,3 +62,38 @@ def test_a_sample_does_not_depend_on_its_batch():
 def test_displacements_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="one per tendon"):
         solve_displacement(one_tendon(), (), T([[1e-3, 1e-3]]), S)
+
+
+def antagonists() -> tuple[torch.Tensor, torch.Tensor]:
+    """Pulls of two tendons at right angles, paid out opposite, and gravity from everywhere."""
+    generator = torch.Generator().manual_seed(12)
+    pull = 0.016 * torch.rand(24, 2, generator=generator, dtype=torch.float64)
+    pull[::5, 0] = 0.0
+    pull[1::7, 1] = pull[1::7, 0]
+    gravity = torch.nn.functional.normalize(torch.randn(24, 3, generator=generator, dtype=torch.float64), dim=-1)
+    return torch.cat([pull, -pull], -1), 9.81 * gravity
+
+
+@pytest.mark.many_fits
+def test_antagonists_pulled_and_paid_out_by_the_same_length():
+    """(1) holds: no path is too long, what is slack carries nothing, and the tensions give the shape back."""
+    d, gravity = antagonists()
+    tendons = tuple(Tendon.straight(x, y, 0.5) for x, y in ((0.015, 0.0), (0.0, 0.015), (-0.015, 0.0), (0.0, -0.015)))
+    robot = Robot(Rod.circular(0.5, 0.002, 200e9, 80e9, 0.0251), Tendons(tendons), gravity)
+    answer = solve_displacement(robot, (), d, T([0.25, 0.5]))
+    assert (answer.equilibrium.status == 0).all()
+    gap = 0.5 - d - answer.path
+    assert (gap > -1e-9).all()
+    assert (answer.tension >= 0).all()
+    assert torch.minimum(answer.tension / 100, gap).abs().max() < 1e-9
+    again = solve_shape(robot, (), answer.tension, T([0.25, 0.5]), len(d))
+    assert (answer.equilibrium.p - again.p).abs().max() < 1e-6
+
+
+def test_the_pair_that_was_refused():
+    """An independent solver, DOP853 and shooting: 15.989, 16.626, 0, 0 N, tip (182.57, 177.80, 399.85) mm."""
+    tendons = tuple(Tendon.straight(x, y, 0.5) for x, y in ((0.01506, 0.0), (0.0, 0.01506), (-0.01506, 0.0), (0.0, -0.01506)))
+    robot = Robot(Rod.circular(0.5, 0.002, 200e9, 80e9, 0.0251327412), Tendons(tendons), T([9.81, 0.0, 0.0]))
+    answer = solve_displacement(robot, (), T([[0.012, 0.012, -0.012, -0.012]]), T([0.5]))
+    assert (answer.tension[0] - T([15.989, 16.626, 0.0, 0.0])).abs().max() < 1e-3
+    assert (answer.equilibrium.p[0, 0] - T([0.18257, 0.17780, 0.39985])).abs().max() < 1e-5

@@ -16,7 +16,6 @@ from torch import Tensor
 from ..estimation import filter as ekf
 from ..estimation.result import ACCEPT, Z95
 from ..estimation.solve import Settings
-from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.robot import Robot
 from ..mechanics.tendons import Tendons
 from ..model.load_families import GaussianCoordinates
@@ -114,7 +113,7 @@ def calibrate(
     youngs_modulus: bool = False,
     tension_offset: bool = False,
     settings: Settings | None = None,
-    steps: int = DEFAULT_STEPS,
+    steps: int | None = None,
 ) -> Calibration:
     """Mass per length, and where asked stiffness and tension offsets, from the shapes of a robot that nothing touches but gravity.
 
@@ -124,7 +123,7 @@ def calibrate(
     Source: the paper, section III.C and (3), (4); docs/model.md.
     """
     none = Unknowns(GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale))
-    Problem(robot, none, [markers], tension, steps).check()
+    Problem(robot, none, [markers], tension).check()
     shapes = UnloadedShapes(robot, markers, tension, markers.weights[:, ::3], youngs_modulus, tension_offset, steps)
     _refuse(shapes)
     return _result(shapes, *_iterate(shapes, settings or Settings()))

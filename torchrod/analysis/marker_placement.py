@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mechanics.grid import DEFAULT_STEPS
 from ..mechanics.robot import Robot
 from ..model.unknowns import Registration
 from ..util.precision import DTYPE
@@ -124,7 +123,7 @@ def place(
     nearest: float | None = None,
     gap: float | None = None,
     directions: int = 8,
-    steps: int = DEFAULT_STEPS,
+    steps: int = 0,
 ) -> Placement:
     """Propose `count` markers for pushes of `force` (N) from `nearest` (m; 10 % of L) to the tip, in every direction.
 

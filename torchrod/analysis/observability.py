@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtri, chndtr
 from torch import Tensor
 
-from ..mechanics.grid import DEFAULT_STEPS, on_rod
+from ..mechanics.grid import on_rod
 from ..mechanics.loads import PointForces
 from ..mechanics.robot import Robot
 from ..mechanics.statics import solve_shape
@@ -61,9 +61,12 @@ def push_problem(
     markers: Markers,
     tension: Float[Tensor, "*B T"] | None = None,
     registration: Registration | None = None,
-    steps: int = DEFAULT_STEPS,
+    steps: int = 0,
 ) -> Problem:
-    """The estimator's problem of one contact, without a prior on it; tensions (N) of every sample or of all."""
+    """The estimator's problem of one contact, without a prior on it; tensions (N) of every sample or of all.
+
+    steps: 0 takes as many as the reference shape asks for.
+    """
     loads = GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale, "none")
     tension = None if tension is None else tension.expand(len(markers.positions), -1)
     return Problem(robot, Unknowns(loads, registration=registration), [markers], tension, steps)
@@ -151,7 +154,7 @@ def load_bound(
     tension: Float[Tensor, "*B T"] | None = None,
     registration: Registration | None = None,
     width_known: bool = True,
-    steps: int = DEFAULT_STEPS,
+    steps: int = 0,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, by (1).
 
@@ -230,7 +233,7 @@ def bounds(
     registration: Registration | None = None,
     width_known: bool = True,
     directions: int = 8,
-    steps: int = DEFAULT_STEPS,
+    steps: int = 0,
 ) -> Observability:
     """What markers at s (m) with this noise (m) see of a push at every place (m; 60 from 2 % of L to the tip) and direction.
 

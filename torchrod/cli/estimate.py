@@ -68,7 +68,7 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
     unknowns = Unknowns(loads, options.unknown_tip, std, _registration(options))
     stated = STATED * rod.length if noise is None else noise
-    return Problem(robot, unknowns, [shapes.markers(stated)], shapes.tension, options.steps)
+    return Problem(robot, unknowns, [shapes.markers(stated)], shapes.tension, options.steps or 0)
 
 
 def estimate(options: Namespace) -> None:
@@ -78,7 +78,6 @@ def estimate(options: Namespace) -> None:
     noise = noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)
-    positive("--steps", options.steps)
     positive("--max-iterations", options.max_iterations)
     writable(options.out, RESULT_SUFFIXES)
     writable(options.plot, FIGURE_SUFFIXES)

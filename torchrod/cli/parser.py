@@ -75,7 +75,7 @@ def _estimate_parser() -> ArgumentParser:
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
-    parser.add_argument("--steps", type=Steps, default=40, help="least number of arc-length steps")
+    parser.add_argument("--steps", type=Steps, default=None, help="least number of arc-length steps; by the reference shape")
     parser.add_argument("--max-iterations", type=int, default=100, help="give a sample up after this many")
     return parser
 
@@ -135,6 +135,7 @@ def _simulate_parser() -> ArgumentParser:
     _number_list(parser, "--at", "arc lengths of the markers (m), instead of --markers")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation added to every coordinate (m)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--steps", type=Steps, default=None, help="arc-length steps, instead of as many as 5e-6 of the length take")
     parser.add_argument("--out", type=str, required=True, help="SHAPE.csv")
     return parser
 

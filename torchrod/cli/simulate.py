@@ -16,7 +16,7 @@ from ..io import Shapes, read_robot, write_shapes
 from ..mechanics.actuation import solve_displacement
 from ..mechanics.loads import Load, PointForces, PointWrenches
 from ..mechanics.robot import Robot
-from ..mechanics.statics import Equilibrium, solve_shape
+from ..mechanics.statics import MOST_STEPS, Equilibrium, solve_shape
 from ..util.errors import InputError
 from ..util.precision import DTYPE
 from ..util.progress import bar
@@ -37,21 +37,56 @@ def simulate(options: Namespace) -> None:
         raise InputError(f"--seed is {options.seed}; it must be from 0 to 2^63 - 1")
     if not (math.isfinite(options.noise) and options.noise >= 0):
         raise InputError(f"--noise is {options.noise}; it must be at least 0")
+    if options.steps is not None and not 1 <= options.steps <= MOST_STEPS:
+        raise InputError(f"--steps is {options.steps}; it must be from 1 to {MOST_STEPS}")
     writable(options.out, (".csv",))
     s = torch.tensor(at, dtype=DTYPE)
     loads = _known_loads(options, L)
     if options.displacement:
-        shape, tensions = _displaced(robot, loads, options.displacement, s)
+        shape, tensions = _displaced(robot, loads, options.displacement, s, options.steps)
     else:
         tensions = torch.tensor([options.tension], dtype=DTYPE) if T else None
-        shape = solve_shape(robot, loads, tensions, s, 1)
+        shape = solve_shape(robot, loads, tensions, s, 1, options.steps)
     if Status(int(shape.status[0])) is not Status.CONVERGED:
-        raise InputError(f"{options.robot}: no equilibrium was found under these loads; check their size and units")
+        raise InputError(f"{options.robot}: {_why(options, robot, shape)}")
     noise = options.noise * torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(options.seed), dtype=DTYPE)
     write_shapes(options.out, Shapes(s, shape.p + noise, ["0"], None, tensions))
     tip = [f"{v * 1e3:.2f}" for v in shape.p[0, -1].tolist()]
     pulled = f", tensions {', '.join(f'{t:.3f}' for t in tensions[0].tolist())} N" if tensions is not None else ""
     print(f"{options.out}: {len(at)} markers, the last at ({', '.join(tip)}) mm{pulled}")  # noqa: T201
+
+
+def _why(options: Namespace, robot: Robot, shape: Equilibrium) -> str:
+    """Why there is no shape, in one sentence that names the load to look at."""
+    load = _heaviest(options, robot)
+    if not bool(shape.resolved[0]):
+        return f"{load} bends or turns the rod more sharply than {MOST_STEPS} steps can follow; check its size and units"
+    if bool(shape.only_unstable[0]):
+        return f"under {load} only an unstable equilibrium was found, in which no rod stays; check its size and units"
+    return f"no equilibrium was found under these loads, of which {load} is the largest; check their size and units"
+
+
+def _heaviest(options: Namespace, robot: Robot) -> str:
+    """The option, or the key of the robot file, whose load is the largest beside the rod's stiffness."""
+    L, rod = robot.rod.length, robot.rod
+    sizes = {
+        "rod.gravity": L * float(robot.weight.norm()),
+        **{f"--point {' '.join(row)}": math.hypot(float(row[1]), float(row[2])) for row in options.point or []},
+        f"--tip-force {_spoken(options.tip_force)}": math.hypot(*(options.tip_force or [0.0])),
+        f"--tip-moment {_spoken(options.tip_moment)}": math.hypot(*(options.tip_moment or [0.0])) / L,
+        f"--tension {_spoken(options.tension)}": sum(map(abs, options.tension or [])) * _reach(robot) / L,
+        f"--displacement {_spoken(options.displacement)}": sum(map(abs, options.displacement or [])) * rod.force_scale / L,
+    }
+    return max(sizes, key=sizes.__getitem__)
+
+
+def _reach(robot: Robot) -> float:
+    """The largest offset of a tendon (m)."""
+    return max((math.hypot(x, y) for t in robot.tendons.tendons for _, x, y in t.routing), default=0.0)
+
+
+def _spoken(values: list[float] | None) -> str:
+    return " ".join(f"{v:g}" for v in values or [])
 
 
 def _places(options: Namespace, L: float) -> list[float]:
@@ -79,9 +114,11 @@ def _actuation(options: Namespace, tendons: int) -> None:
         raise InputError(f"{name} {values}: must be finite" + (" and at least 0 N" if name == "--tension" else ""))
 
 
-def _displaced(robot: Robot, loads: tuple[Load, ...], displacement: list[float], s: Tensor) -> tuple[Equilibrium, Tensor]:
+def _displaced(
+    robot: Robot, loads: tuple[Load, ...], displacement: list[float], s: Tensor, steps: int | None
+) -> tuple[Equilibrium, Tensor]:
     """The shape with so much of every tendon pulled out, and what its load cells read (1, T) N."""
-    answer = solve_displacement(robot, loads, torch.tensor([displacement], dtype=DTYPE), s)
+    answer = solve_displacement(robot, loads, torch.tensor([displacement], dtype=DTYPE), s, steps)
     reading = answer.tension - torch.tensor([t.tension_offset for t in robot.tendons.tendons], dtype=DTYPE)
     if bool((reading < 0).any()):
         raise InputError("a slack tendon's load cell would read less than 0 N, by its tension_offset; set that to 0 to simulate")

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import kernel
+from ..mechanics.robot import Robot
 from ..mechanics.statics import LOAD_PER_INCREMENT, ROUGH_TOLERANCE, solve_shape
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
@@ -17,6 +18,8 @@ from ..util.by_value import Kept, key
 from .evaluator import KernelEvaluator, family_of, kernel_serves
 
 _bare = Kept()
+
+HEAVY = 7.0  # in EI / L^3: the weight under which an upright rod buckles is 7.84
 
 
 @dataclass(frozen=True)
@@ -31,14 +34,16 @@ def at_rest(problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, 
     """The base wrench and the shape at problem.s under the loads gamma and the tensions, to ROUGH_TOLERANCE on coarse steps.
 
     q_tip: the orientation of the tip near which to look, where it is known: sooner found. By the compiled kernel where it serves;
-    what does not settle there, and all else, by torchrod.solve_shape, which is the definition.
+    what does not settle there, rods so heavy that an upright one would fall over, and all else, by torchrod.solve_shape, which is
+    the definition and stays in stable equilibrium.
     """
     s, B, P, family = problem.s, len(gamma), len(problem.s), problem.unknowns.loads
     plain = Problem(problem.robot, Unknowns(family), [Markers(s, s.new_empty(B, 0, 3), 1.0)], problem.tension, problem.coarse.steps)
     wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
     settled = torch.zeros(B, dtype=torch.bool)
-    if family_of(plain) != "point" and problem.robot.gravity.ndim == 1 and kernel_serves(plain):
-        increments = _increments(problem) if q_tip is None else 1
+    light = problem.robot.gravity.ndim == 1 and math.isfinite(_weight(problem.robot))
+    if light and family_of(plain) != "point" and kernel_serves(plain):
+        increments = _increments(problem.robot) if q_tip is None else 1
         wrench, missed, p = KernelEvaluator(plain).balance(gamma, q_tip, increments, ROUGH_TOLERANCE)
         settled = (missed <= ROUGH_TOLERANCE) & torch.isfinite(wrench).all(-1)
     if bool(settled.all()):
@@ -68,7 +73,12 @@ def without_load(problem: Problem, s: Float[Tensor, " P"] | None = None) -> Rest
     return Rest(rest.wrench.expand(B, 6), rest.p.expand(B, *rest.p.shape[1:]))
 
 
-def _increments(problem: Problem) -> int:
+def _weight(robot: Robot) -> float:
+    """In EI / L^3; infinite where the rod has no stiffness to speak of."""
+    load = float(robot.weight.norm()) * robot.rod.length**3
+    return load / robot.rod.bending_stiffness if load < HEAVY * robot.rod.bending_stiffness else math.inf
+
+
+def _increments(robot: Robot) -> int:
     """In how many parts the weight is put on, so that each is no more than solve_shape's."""
-    rod, weight = problem.robot.rod, problem.robot.weight
-    return max(1, math.ceil(float(weight.norm()) * rod.length**3 / rod.bending_stiffness / LOAD_PER_INCREMENT))
+    return max(1, math.ceil(_weight(robot) / LOAD_PER_INCREMENT))

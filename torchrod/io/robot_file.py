@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ ROD_KEYS = {
 SECTION_KEYS = ("diameter", "youngs_modulus", "shear_modulus")
 SOFTEST, HARDEST = 1e4, 2e12  # Pa: below the softest silicone and above diamond
 RUBBER, SLENDER = 1e6, 1 / 40  # Pa, and a diameter over the length: so soft and so slender a rod does not hold itself
+MOST_COILS = 200  # turns of the unloaded rod
 TENDON_KEYS = {"offset", "routing", "ends_at", "tension_offset"}
 
 
@@ -48,10 +50,24 @@ def _stiffness(where: str, value: object) -> torch.Tensor:
 
 
 def _curvature(where: str, value: object) -> list[list[float]]:
-    """Rows [s, ux, uy, uz], or one [ux, uy, uz] for the whole rod."""
+    """Rows [s, ux, uy, uz], two with the same s for a jump, or one [ux, uy, uz] for the whole rod."""
     if isinstance(value, list) and value and not isinstance(value[0], list):
         return [[0.0, *as_numbers(where, value, 3)]]
-    return as_rows(where, value, 4)
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{where} must be [ux, uy, uz] or a list of rows [s, ux, uy, uz]")
+    rows = [as_numbers(f"{where}[{i}]", row, 4) for i, row in enumerate(value)]
+    if any(b[0] < a[0] for a, b in pairwise(rows)):
+        raise InputError(f"{where}: s must not fall from row to row")
+    if any(c[0] == a[0] for a, c in zip(rows, rows[2:], strict=False)):
+        raise InputError(f"{where}: more than two rows have the same s; give two, before and after the jump")
+    return rows
+
+
+def _coils(rows: list[list[float]], length: float) -> float:
+    """How many turns the rod makes at most without load."""
+    ends = [(0.0, math.hypot(*rows[0][1:])), *((r[0], math.hypot(*r[1:])) for r in rows), (length, math.hypot(*rows[-1][1:]))]
+    inside = [(min(max(s, 0.0), length), u) for s, u in ends]
+    return sum((b - a) * max(u, w) for (a, u), (b, w) in pairwise(inside)) / (2 * math.pi)
 
 
 def _rod(path: Path, table: dict[str, Any]) -> Rod:
@@ -61,7 +77,10 @@ def _rod(path: Path, table: dict[str, Any]) -> Rod:
     length = as_number(f"{where}.length", table["length"], positive=True)
     mass = as_number(f"{where}.mass_per_length", table.get("mass_per_length", 0.0), least=0.0)
     curvature = table.get("reference_curvature")
-    rows = None if curvature is None else torch.tensor(_curvature(f"{where}.reference_curvature", curvature), dtype=DTYPE)
+    table_of = None if curvature is None else _curvature(f"{where}.reference_curvature", curvature)
+    if table_of is not None and not (turns := _coils(table_of, length)) <= MOST_COILS:
+        raise InputError(f"{where}.reference_curvature winds the rod {turns:.4g} times, more than {MOST_COILS}; it must be in 1/m")
+    rows = None if table_of is None else torch.tensor(table_of, dtype=DTYPE)
     if not 1e-3 <= length <= 10:
         warnings.warn(f"{where}.length is {length} m, unusual for a continuum robot; are the units metres?", stacklevel=2)
     if "K_se" in table or "K_bt" in table:

@@ -1,5 +1,6 @@
 """The arc-length grid: where the steps of the integration begin and end."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 DEFAULT_STEPS = 40  # RK4 is then within 1e-7 m of the exact shape for ordinary loads (docs/model.md)
+TURN_OF_ALL = 10.0  # rad: the turn of the unloaded rod that is shared out among the steps; one that turns further gets more of them
 SAME_POINT = 1e-9  # m: marker and tendon end closer than this share a node
 TIP = 1e-6  # of the length: so far beyond it, a place is at the tip, in single precision
 
@@ -37,6 +39,15 @@ class Grid:
         """The outputs' nodes, and the first node."""
         return torch.cat([self.outputs, torch.zeros_like(self.outputs[..., :1])], -1)
 
+    def cut(self, pieces: int) -> Int[Tensor, "... n"]:
+        """The nodes at or just beyond the ends of so many equal pieces."""
+        places = self.nodes[..., -1:] * torch.linspace(0, 1, pieces + 1, dtype=self.nodes.dtype)
+        return torch.searchsorted(self.nodes.detach().contiguous(), (places - SAME_POINT).contiguous())
+
+    def take(self, index: Int[Tensor, " b"]) -> "Grid":
+        """The samples of an index."""
+        return self if self.nodes.ndim == 1 or len(self.nodes) == 1 else Grid(self.nodes[index], self.outputs[index])
+
     @property
     def h(self) -> Float[Tensor, "... S"]:
         """Step lengths (m)."""
@@ -60,10 +71,13 @@ def make_grid(
     ends: tuple[float, ...] = (),
     breakpoints: Float[Tensor, "... K"] | None = None,
     steps: int = DEFAULT_STEPS,
+    curvature: Callable[[Float[Tensor, " K"], Float[Tensor, " K"]], Float[Tensor, "K 3"]] | None = None,
 ) -> Grid:
-    """Nodes at 0, L, the outputs, the tendon ends and the breakpoints, filled up so that no step is longer than L / steps (m).
+    """Nodes at 0, L, the outputs, the ends (of tendons, of pieces of the reference curvature) and the breakpoints.
 
-    Errors: ValueError for outputs that do not lie on the rod.
+    Filled up so that no step is longer than L / steps (m), nor turns the unloaded rod by more than TURN_OF_ALL / steps (rad).
+    curvature: u* (1/m) at s on the side of `inside`, linear between the ends. Errors: ValueError for outputs that do not lie on the
+    rod.
     """
     if not bool(on_rod(outputs, length).all()):
         raise ValueError(f"outputs run from {float(outputs.min())} to {float(outputs.max())} m, outside the rod of 0 to {length} m")
@@ -71,6 +85,10 @@ def make_grid(
     fixed = torch.cat([outputs.new_tensor([0.0, length, *ends]), outputs]).sort().values
     fixed = fixed[torch.cat([torch.tensor([True]), fixed.diff() > SAME_POINT])]
     pieces = (fixed.diff() / (length / steps) - 1e-9).ceil().clamp(min=1).to(torch.int64)
+    if curvature is not None:
+        a, b, inside = fixed[:-1], fixed[1:], 0.5 * (fixed[:-1] + fixed[1:])
+        bend = torch.maximum(curvature(a, inside).norm(dim=-1), curvature(b, inside).norm(dim=-1)).detach().nan_to_num(0.0)
+        pieces = torch.maximum(pieces, (bend * fixed.diff() * steps / TURN_OF_ALL - 1e-9).ceil().to(torch.int64))
     fill = [
         a + (b - a) * torch.arange(n, dtype=fixed.dtype) / n for a, b, n in zip(fixed[:-1], fixed[1:], pieces.tolist(), strict=True)
     ]

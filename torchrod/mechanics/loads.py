@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..util.precision import Float64
@@ -76,6 +76,17 @@ def _check_length(length: float) -> None:
         raise ValueError(f"length is {length} m; it must be positive and finite")
 
 
+def taken(loads: tuple[Load, ...], index: Int[Tensor, " b"]) -> tuple[Load, ...] | None:
+    """The loads of the samples of an index; None where a load of the user's own does not say how it is divided (`take`)."""
+    parts = [getattr(load, "take", None) for load in loads]
+    return None if any(take is None for take in parts) else tuple(take(index) for take in parts if take is not None)
+
+
+def _rows(x: Tensor, own: int, index: Int[Tensor, " b"]) -> Tensor:
+    """The samples of an index of a parameter with `own` dimensions of its own; a parameter of all samples stays as it is."""
+    return x if x.ndim <= own or len(x) == 1 else x[index]
+
+
 def _normal_to_rod(f: Float[Tensor, "... 2"]) -> Vector:
     """(f_x, f_y, 0): the paper's loads are normal to the rod (9)."""
     return torch.cat([f, torch.zeros_like(f[..., :1])], -1)
@@ -116,6 +127,10 @@ class GaussianLoads(Float64):
     def breakpoints(self) -> None:
         """None: a Gaussian has no jump."""
 
+    def take(self, index: Int[Tensor, " b"]) -> "GaussianLoads":
+        """The samples of an index."""
+        return GaussianLoads(_rows(self.a, 2, index), _rows(self.mu, 1, index), _rows(self.c, 1, index))
+
     def density(self, s: Float[Tensor, " S"]) -> Float[Tensor, "... S 3"]:
         """f(s), (10)."""
         shape = torch.exp(-self.c.unsqueeze(-2) * (s.unsqueeze(-1) - self.mu.unsqueeze(-2)) ** 2)
@@ -150,6 +165,10 @@ class PointForces(Float64):
         """The points of application: step boundaries that move with s_k, so derivatives in s_k are exact."""
         return self.s
 
+    def take(self, index: Int[Tensor, " b"]) -> "PointForces":
+        """The samples of an index."""
+        return PointForces(_rows(self.force, 2, index), _rows(self.s, 1, index))
+
     def density(self, s: Float[Tensor, " S"]) -> None:
         """None: a point force has no density."""
 
@@ -183,6 +202,10 @@ class PointWrenches(Float64):
     def breakpoints(self) -> Float[Tensor, " K"]:
         """The points of application."""
         return self.s
+
+    def take(self, index: Int[Tensor, " b"]) -> "PointWrenches":
+        """The samples of an index."""
+        return PointWrenches(_rows(self.force, 2, index), _rows(self.moment, 2, index), self.s, self.frame)
 
     def density(self, s: Float[Tensor, " S"]) -> None:
         """None: a point wrench has no density."""
@@ -223,6 +246,10 @@ class FourierLoads(Float64):
     def breakpoints(self) -> None:
         """None: a Fourier load has no jump."""
 
+    def take(self, index: Int[Tensor, " b"]) -> "FourierLoads":
+        """The samples of an index."""
+        return FourierLoads(_rows(self.cosine, 2, index), _rows(self.sine, 2, index), self.length)
+
     def density(self, s: Float[Tensor, " S"]) -> Float[Tensor, "... S 3"]:
         """f(s)."""
         _, sin, cos = self._waves(s)
@@ -257,6 +284,10 @@ class PolynomialLoads(Float64):
 
     def breakpoints(self) -> None:
         """None: a polynomial load has no jump."""
+
+    def take(self, index: Int[Tensor, " b"]) -> "PolynomialLoads":
+        """The samples of an index."""
+        return PolynomialLoads(_rows(self.coefficients, 2, index), self.length)
 
     def density(self, s: Float[Tensor, " S"]) -> Float[Tensor, "... S 3"]:
         """f(s)."""

@@ -29,10 +29,10 @@ def check_stiffness(name: str, K: Tensor, unit: str) -> None:
 class Rod(Float64):
     """A straight or pre-curved rod of uniform section, clamped at s = 0, leaving the base frame along +z.
 
-    Constitutive law in the section frame: n = K_se (v - e3), m = K_bt (u - u*).
-    length: L (m). K_se: shear and axial stiffness (3, 3), N. K_bt: bending and torsion stiffness (3, 3), N m^2.
-    mass_per_length: kg/m. reference_curvature: rows [s, u*_x, u*_y, u*_z] (m, 1/m), linear in between; one row is constant.
-    One rod serves the whole batch. Errors: ValueError for what is no rod. Source: Rucker & Webster 2011, eq. (4)-(6).
+    Constitutive law in the section frame: n = K_se (v - e3), m = K_bt (u - u*). length: L (m). K_se: shear and axial stiffness (3,
+    3), N. K_bt: bending and torsion stiffness (3, 3), N m^2. mass_per_length: kg/m. reference_curvature: rows [s, u*_x, u*_y, u*_z]
+    (m, 1/m), s not falling: linear in between, constant beyond, a jump where two rows have the same s. One row is constant. One rod
+    serves the whole batch. Errors: ValueError for what is no rod. Source: Rucker & Webster 2011, eq. (4)-(6).
     """
 
     length: float
@@ -95,7 +95,7 @@ class Rod(Float64):
     @property
     def bending_stiffness(self) -> float:
         """EI (N m^2): the geometric mean of the two bending stiffnesses, the rod's scale of stiffness."""
-        return float((self.K_bt[0, 0] * self.K_bt[1, 1]).sqrt())
+        return float((self.K_bt[0, 0] * self.K_bt[1, 1]).detach().sqrt())
 
     @property
     def force_scale(self) -> float:
@@ -107,12 +107,30 @@ class Rod(Float64):
         """2 EI / L (N m): 0.2 N m for the paper's rod."""
         return 2 * self.bending_stiffness / self.length
 
-    def curvature_at(self, s: Float[Tensor, "..."]) -> Float[Tensor, "... 3"]:
-        """u*(s) (1/m), section frame, linear between the rows and constant beyond them."""
+    @property
+    def softest(self) -> float:
+        """The least of the three stiffnesses in bending and torsion (N m^2)."""
+        return float(torch.linalg.eigvalsh(self.K_bt.detach())[0])
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        """Arc lengths (m) on the rod at which u* jumps or bends: step boundaries of the integration."""
+        rows = self.reference_curvature
+        return tuple(s for s in rows[:, 0].tolist() if 0 < s < self.length) if len(rows) > 1 else ()
+
+    @property
+    def straight(self) -> bool:
+        """Whether u* is zero all along."""
+        return not bool((self.reference_curvature[:, 1:] != 0).any())
+
+    def curvature_at(self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."]) -> Float[Tensor, "... 3"]:
+        """u*(s) (1/m), section frame; `inside` is a point of the same step and decides on which side of a jump s lies."""
         rows = self.reference_curvature
         if rows.shape[0] == 1:
             return rows[0, 1:].expand(*s.shape, 3)
-        right = torch.searchsorted(rows[:, 0].contiguous(), s.detach().contiguous()).clamp(1, rows.shape[0] - 1)
+        right = torch.searchsorted(rows[:, 0].contiguous(), inside.detach().contiguous()).clamp(1, rows.shape[0] - 1)
         low, high = rows[right - 1], rows[right]
-        t = ((s - low[..., 0]) / (high[..., 0] - low[..., 0])).clamp(0, 1)
-        return low[..., 1:] + t.unsqueeze(-1) * (high[..., 1:] - low[..., 1:])
+        span = high[..., 0] - low[..., 0]
+        # A table may begin or end with a jump, and then has no span there.
+        t = torch.where(span > 0, (s - low[..., 0]) / torch.where(span > 0, span, 1.0), (inside > low[..., 0]).to(s.dtype))
+        return low[..., 1:] + t.clamp(0, 1).unsqueeze(-1) * (high[..., 1:] - low[..., 1:])

@@ -22,7 +22,7 @@ forward mode, compiled whole, or traced into a kernel.
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .lie import Matrix, Vector, cross, inverse3, matvec, normalized, quaternion_rate, rotate, unrotate
@@ -79,6 +79,14 @@ class StageTable:
     def reversed(self) -> "StageTable":
         """A single step's stages in the order in which a walk towards the base meets them."""
         return self._map(lambda x, trailing=1: x.flip(-1 - trailing))
+
+    def take(self, index: Int[Tensor, " b"]) -> "StageTable":
+        """The samples of an index, of the whole table; what the samples share stays shared."""
+        return self._map(lambda x, trailing=1: x if x.ndim == 2 + trailing or len(x) == 1 else x[index])
+
+    def detached(self) -> "StageTable":
+        """The same numbers without their derivatives."""
+        return self._map(lambda x, trailing=1: x.detach())
 
     def with_base_frame_loads_scaled(self, fraction: Float[Tensor, " B"]) -> "StageTable":
         """The loads of the base frame multiplied by a fraction per sample: increments of load in the forward solve."""

@@ -22,7 +22,7 @@ from ..mechanics.lie import Matrix, Vector, exponential, move, product, unrotate
 from ..mechanics.loads import LoadIntegrals, total
 from ..mechanics.robot import Robot
 from ..mechanics.section import Section
-from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table
+from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table, steps_of_rod
 from ..util.by_value import Kept
 from ..util.precision import DTYPE, Float64
 from .sensors import Markers, RodState, Sensor
@@ -56,16 +56,17 @@ class Problem(Float64):
 
     robot: known but for the unknowns. unknowns: what is to be estimated of each sample. sensors: what was read of B samples, with
     its noise; their rows stand one after the other in h. tension: (B, T) N for a tendon robot, the readings of its load cells.
-    steps: the least number of arc-length steps. prior: mean and precision of x instead of the unknowns' own, (n) or (B, n), in the
-    units of `state`. tip_std: standard deviations (N, N m) of a component of the tip residual, W^-1/2 of the paper's W on c; None:
-    TIP_FORCE_STD and TIP_MOMENT_STD in the rod's scales. Errors: ValueError of `check`.
+    steps: the least number of arc-length steps; 0: as many as the reference shape asks for. prior: mean and precision of x instead
+    of the unknowns' own, (n) or (B, n), in the units of `state`. tip_std: standard deviations (N, N m) of a component of the tip
+    residual, W^-1/2 of the paper's W on c; None: TIP_FORCE_STD and TIP_MOMENT_STD in the rod's scales. Errors: ValueError of
+    `check`.
     """
 
     robot: Robot
     unknowns: Unknowns
     sensors: Sequence[Sensor]
     tension: Float[Tensor, "B T"] | None = None
-    steps: int = DEFAULT_STEPS
+    steps: int = 0
     prior: tuple[Tensor, Tensor] | None = None
     tip_std: tuple[float, float] | None = None
 
@@ -74,6 +75,9 @@ class Problem(Float64):
         if hasattr(self.sensors, "predict"):
             raise ValueError("Problem.sensors takes a list, [sensor]")
         object.__setattr__(self, "sensors", tuple(self.sensors))
+        if self.steps == 0:
+            known = bool(self.sensors) and bool(on_rod(self.s, self.robot.rod.length).all())  # else `check` says what is wrong
+            object.__setattr__(self, "steps", steps_of_rod(self.robot, self.s) if known else DEFAULT_STEPS)
 
     # What is unknown.
 
