@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from studies.reproduction import paper_mode, study2, tables
+from studies.reproduction import paper_mode, printed_rows, study2
 
 from tests.robots import steel_rod
 from torchrod import PaperCoordinates, paper_settings
@@ -63,7 +63,7 @@ def test_the_printed_rows_are_those_of_the_shared_facts():
     shared = ROOT.parent / "shared" / "data" / "paper_tables.csv"
     if not shared.exists():
         pytest.skip("the facts of the paper are not beside the repository")
-    assert tables.ROWS.read_text() == shared.read_text()
+    assert printed_rows.ROWS.read_text() == shared.read_text()
 
 
 @pytest.mark.many_fits

@@ -9,9 +9,9 @@ import torch
 
 from . import errata_shown as shown
 from .cases import steel_rod, study1
+from .printed_rows import TEXT, paper_means
 from .sensitivity import jacobian, unit_check
 from .sinusoids import clamped, clamped_closed, rigid_section, supported, supported_closed
-from .tables import ABOUT, TEXT, paper_means
 from .tip_sensitivity import tip_figures
 
 HEAD = """# Errata of the paper
@@ -38,7 +38,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
         "over_the_tip": shown.over_the_tip(),
         "sensitivity": tip_figures()["at_1_mN"],
         "units": unit_check(jacobian(steel_rod(), torch.ones(1).double(), torch.full((1,), 0.2).double())[0]),
-        "means": {table: paper_means(table) for table in ABOUT},
+        "means": {table: list(paper_means(table)) for table in TEXT},
         "points": shown.points(),
     }
     sections = (_innovation, _index, _deflection, _damping, _actuation, _tables, _sums, _beyond, _joint, _points)

@@ -3,7 +3,8 @@
 from typing import Any
 
 from .cases import mean_error
-from .tables import ABOUT, READINGS, means, paper_means
+from .printed_rows import READINGS, paper_means
+from .tables import ABOUT, means
 
 STUDY1 = {"clean": ("91", 2.1, 3.5, 0.08), "noise_1mm": ("-", None, 20.1, 0.53)}  # mm, N: the paper's; 91: 2.1 s at 23 ms each
 NAMES = {"clean": "without noise", "noise_1mm": "1 mm noise"}

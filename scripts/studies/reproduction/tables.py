@@ -5,10 +5,7 @@ two loads of a double case. The sign of the actuation is read in two ways: negat
 its tendons must be pulled), so that the positive values of Table I are a tendon let go; or its size alone, always pulled.
 """
 
-import csv
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +18,7 @@ from tqdm import tqdm
 
 from torchrod import Estimate, Fit, Robot, Status, draw_on
 
+from .printed_rows import READINGS, TEXT, Case, mean_known, paper_means, printed, read_cases
 from .twins import DIAMETER, MARKERS, MISMATCH, NOISE, TENSION_STD, Twin, one_tendon, twin, two_tendons
 
 ABOUT = {
@@ -28,55 +26,9 @@ ABOUT = {
     "II": "1-DoF robot, two loads",
     "III": "2-DoF robot, one or two loads",
 }
-TEXT = {"I": (0.32, 0.027), "II": (0.51, 0.0264), "III": (0.65, 0.0398)}  # mean errors in the paper's text, N and m
-DIRECTION = {"in": (1.0, 0.0), "out": (0.0, 1.0), "": (math.sqrt(0.5), math.sqrt(0.5))}  # of a load, by its plane
-READINGS = {"negative_is_pulled": "negative is pulled", "size_only": "size only"}
 MODELS = {"with_mismatch": MISMATCH, "without_mismatch": 0.0}
 FIGURE6 = ("1", "4", "7")  # cases of Table III
 MEASURED = "#e0a800"
-ROWS = Path(__file__).with_name("tables.csv")
-
-
-@dataclass(frozen=True)
-class Case:
-    """One experiment: its printed rows, one per load, and the actuation (cm as printed, which can only be mm)."""
-
-    table: str
-    pair: str
-    rows: tuple[dict[str, str], ...]
-
-    @property
-    def actuation(self) -> tuple[float, ...]:
-        """As printed, one per tendon."""
-        return tuple(float(self.rows[0][f"actuation_{j + 1}"]) for j in range(1 + (self.table == "III")))
-
-    def pulled(self, reading: str) -> tuple[float, ...]:
-        """Displacement (m) under a reading; negative: let go."""
-        return tuple(1e-3 * (-a + 0.0 if reading == "negative_is_pulled" else abs(a)) for a in self.actuation)
-
-    @property
-    def readings(self) -> list[str]:
-        """The readings that differ."""
-        return [r for r in READINGS if r == "negative_is_pulled" or self.pulled(r) != self.pulled("negative_is_pulled")]
-
-    @property
-    def force(self) -> Tensor:
-        """Measured, (K, 2) N."""
-        return torch.tensor([[float(r["measured_N"]) * c for c in DIRECTION[r["plane"]]] for r in self.rows], dtype=torch.float64)
-
-    @property
-    def location(self) -> Tensor:
-        """Measured, (K,) m."""
-        return torch.tensor([1e-2 * float(r["measured_cm"]) for r in self.rows], dtype=torch.float64)
-
-
-def read_cases() -> list[Case]:
-    """tables.csv."""
-    cases: dict[tuple[str, str], list[dict[str, str]]] = {}
-    with ROWS.open(newline="") as file:
-        for row in csv.DictReader(file):
-            cases.setdefault((row["table"], row["pair"]), []).append(row)
-    return [Case(*key, tuple(rows)) for key, rows in cases.items()]
 
 
 def matched(case: Twin, fit: Estimate) -> tuple[Tensor, Tensor]:
@@ -112,22 +64,6 @@ def found(case: Twin, fit: Estimate, draws: slice, load: int) -> dict[str, Any]:
         "location_m": spread(location),
         "force_error_N_mean": None if none else float(error.nanmean()),
         "location_error_m_mean": None if none else float(off.nanmean()),
-    }
-
-
-def printed(case: Case, load: int) -> dict[str, Any]:
-    """A row of the paper."""
-    r = case.rows[load]
-    return {
-        "table": case.table,
-        "pair": case.pair,
-        "load": load + 1,
-        "plane": r["plane"],
-        "actuation_printed": list(case.actuation),
-        "measured_N": float(r["measured_N"]),
-        "measured_m": 1e-2 * float(r["measured_cm"]),
-        "paper_N": float(r["estimated_N"]),
-        "paper_m": 1e-2 * float(r["estimated_cm"]),
     }
 
 
@@ -187,19 +123,7 @@ def means(rows: list[dict[str, Any]], table: str, reading: str, model: str) -> t
     """Mean errors (N, m) of our twins over the printed rows of a table that could be simulated and fitted."""
     of = [row["readings"][reading][model] for row in rows if row["table"] == table]
     force, location = ([x[f"{key}_mean"] for x in of] for key in ("force_error_N", "location_error_m"))
-    return _mean(force), _mean(location)
-
-
-def paper_means(table: str) -> tuple[float, float]:
-    """Mean errors (N, m) of the paper's estimates over its printed rows."""
-    rows = [printed(case, k) for case in read_cases() if case.table == table for k in range(len(case.rows))]
-    force, location = ([abs(r[f"paper_{u}"] - r[f"measured_{u}"]) for r in rows] for u in ("N", "m"))
-    return _mean(force), _mean(location)
-
-
-def _mean(values: Sequence[float | None]) -> float:
-    known = [v for v in values if v is not None]
-    return sum(known) / len(known) if known else math.nan
+    return mean_known(force), mean_known(location)
 
 
 def _head(draws: int) -> list[str]:
