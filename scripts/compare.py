@@ -82,13 +82,15 @@ class Checkout:
 
 # The one place, beside `_api`, that knows names inside a checkout: where its compiled kernel is.
 KERNEL = """
-import importlib, json, torchrod
+import importlib, inspect, json, torchrod
 for name in ("kernel", "fast"):
     try:
-        found = importlib.import_module(f"torchrod.{name}").library(wait=True)
-        break
-    except (ImportError, AttributeError, TypeError):
+        library = importlib.import_module(f"torchrod.{name}").library
+    except (ImportError, AttributeError):
         found = None
+        continue
+    found = library(wait=True) if "wait" in inspect.signature(library).parameters else library()
+    break
 print(json.dumps([torchrod.__file__, None if found is None else found._name]))
 """
 
