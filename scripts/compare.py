@@ -82,13 +82,15 @@ class Checkout:
 
 # The one place, beside `_api`, that knows names inside a checkout: where its compiled kernel is.
 KERNEL = """
-import importlib, json, torchrod
+import importlib, inspect, json, torchrod
 for name in ("kernel", "fast"):
     try:
-        found = importlib.import_module(f"torchrod.{name}").library(wait=True)
-        break
-    except (ImportError, AttributeError, TypeError):
+        library = importlib.import_module(f"torchrod.{name}").library
+    except (ImportError, AttributeError):
         found = None
+        continue
+    found = library(wait=True) if "wait" in inspect.signature(library).parameters else library()
+    break
 print(json.dumps([torchrod.__file__, None if found is None else found._name]))
 """
 
@@ -392,7 +394,7 @@ def _timed_commands(checkout: Checkout, folder: Path) -> dict[str, float]:
     commands = {
         "torchrod --help": ["--help"],
         "torchrod estimate, docs/example/rod.csv": ["estimate", str(example / "rod.toml"), str(example / "rod.csv")],
-        "torchrod estimate, 4096 shapes": ["estimate", "one-robot.toml", "many.npz", "--out", "many-out.npz"],
+        "torchrod estimate, 256 shapes": ["estimate", "timed-robot.toml", "many.npz", "--out", "many-out.npz"],
     }
     found = {}
     for name, arguments in commands.items():
@@ -404,18 +406,17 @@ def _timed_commands(checkout: Checkout, folder: Path) -> dict[str, float]:
 
 def speed(old: Checkout, new: Checkout, folder: Path, rounds: int, say: Callable[[str], None]) -> dict[str, dict[str, list[float]]]:
     """Seconds by what is timed and by checkout, one per round; the checkout that goes first changes from round to round."""
-    one = _dataset(old, folder, "one", ROD, 256, SEED, PUSH)
+    one = _dataset(old, folder, "timed", ROD, 256, SEED, PUSH)
     random, end = np.random.default_rng(SEED), one["positions_clean"][:2]
     share = np.linspace(0, 1, 60)[:, None, None]
     film = (1 - share) * end[0] + share * (0.9 * end[0] + 0.1 * end[1]) + NOISE * random.standard_normal((60, *end[0].shape))
     np.savez(folder / "speed.npz", positions=one["positions"], film=film)
-    many = np.resize(one["positions"], (4096, *one["positions"].shape[1:]))
-    np.savez(folder / "many.npz", s=one["s"], positions=many)
+    np.savez(folder / "many.npz", s=one["s"], positions=one["positions"])
     found: dict[str, dict[str, list[float]]] = {}
     for i in range(rounds):
         for checkout in (old, new) if i % 2 == 0 else (new, old):
             say(f"speed, round {i + 1} of {rounds}, {checkout.label}")
-            script = [str(Path(__file__).resolve()), "--worker", "one-robot.toml", "speed.npz"]
+            script = [str(Path(__file__).resolve()), "--worker", "timed-robot.toml", "speed.npz"]
             taken = _timed_commands(checkout, folder) | json.loads(checkout.run(*script, folder=folder, module=False, threads=None))
             for name, seconds in taken.items():
                 found.setdefault(name, {}).setdefault(checkout.label, []).append(seconds)
