@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from torchrod.analysis.diagnosis import diagnose
 from torchrod.cli import main, table
 from torchrod.cli.parser import COMMANDS
 from torchrod.cli.screen import one_line
+from torchrod.data import workers
 from torchrod.data.shards import prepare_folder
 from torchrod.data.spec_file import read_dataset_spec
 from torchrod.learned.features import features, kriging, smoothed
@@ -315,3 +317,23 @@ def test_features_of_gaps_are_nearly_those_without(fitted):
     gaps, alone, whole = (features(posed(markers.s, p)) for p in (positions, positions[:1], markers.positions))
     assert (gaps.amp / whole.amp - 1).abs().max() < 0.2
     assert torch.allclose(gaps.x[:1], alone.x, atol=1e-9)
+
+
+def test_a_scheduler_that_dies_is_told_in_one_sentence(monkeypatch):
+    """The client cancels every task then."""
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install torchrod[scale]")
+
+    class Client:
+        def __init__(self, *_, **__): ...
+
+        __enter__ = __exit__ = lambda *_: None
+
+        def get_executor(self, pure):
+            assert not pure
+
+    monkeypatch.setattr(distributed, "Client", Client)
+    with (
+        pytest.raises(InputError, match="--scheduler tcp://a:1: has died; start it and run the command again"),
+        workers._cluster("tcp://a:1"),
+    ):
+        raise CancelledError

@@ -5,12 +5,13 @@ leaves nothing behind but a shard to be computed again.
 """
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from pathlib import Path
@@ -100,6 +101,7 @@ def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
         from distributed import Client, KilledWorker
     except ImportError:
         raise InputError("--scheduler needs dask.distributed; install it with: pip install torchrod[scale]") from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # of a connection that is lost we tell in one sentence
     try:
         client: Any = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -110,3 +112,7 @@ def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
             yield client.get_executor(pure=False), lambda: 2 * max(1, sum(client.nthreads().values()))
         except KilledWorker as error:
             raise InputError(f"--scheduler {address}: workers died again and again ({error}); give them more memory") from None
+        except CancelledError:  # of every task, once it is known that the scheduler is gone
+            raise InputError(
+                f"--scheduler {address}: has died; start it and run the command again, which keeps the shards that are there"
+            ) from None
