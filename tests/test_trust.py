@@ -4,7 +4,7 @@ import pytest
 from matplotlib.figure import Figure
 from studies.trust import coverage, frame, markers, mistakes, unknown_noise
 
-from torchrod import Estimate
+from torchrod import Estimate, estimate
 
 pytestmark = [pytest.mark.many_fits, pytest.mark.study]
 
@@ -27,7 +27,7 @@ def test_one_frame_for_many_shapes():
     true, clean = frame._cases(12)
     fit = frame._one_frame(12, 12, 3)
     assert isinstance(fit, Estimate)
-    alone = frame.estimate(frame.model(1), clean, frame.NOISE)
+    alone = estimate(frame.posed(clean, frame.pushed(1)))
     for i in (0, 1):
         assert frame._errors(fit, true)[i] < 1.6 * frame._errors(alone, true)[i]
     axes = Figure().subplots()
