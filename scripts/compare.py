@@ -81,15 +81,16 @@ class Checkout:
 
 
 # The one place, beside `_api`, that knows names inside a checkout: where its compiled kernel is.
+# Older ones build it beside other work unless they are told to wait.
 KERNEL = """
 import importlib, inspect, json, torchrod
+found = None
 for name in ("kernel", "fast"):
     try:
         library = importlib.import_module(f"torchrod.{name}").library
     except (ImportError, AttributeError):
-        found = None
         continue
-    found = library(wait=True) if "wait" in inspect.signature(library).parameters else library()
+    found = library(**({"wait": True} if "wait" in inspect.signature(library).parameters else {}))
     break
 print(json.dumps([torchrod.__file__, None if found is None else found._name]))
 """

@@ -31,7 +31,7 @@ from studies.reproduction.paper_mode import STRICT, TABLE, rank, unlike
 from studies.reproduction.study1 import figures_of
 from tqdm import tqdm
 
-from torchrod import Model, PaperCoordinates, estimate, paper_settings
+from torchrod import PaperCoordinates, Problem, Unknowns, estimate, paper_settings
 
 NOISE = 1e-3
 HOPELESS = 0.5  # of the cases accepted: where there are no more, the strict criterion is not tried, and has none
@@ -73,16 +73,17 @@ def tried(tuning: Tuning, study: Study) -> dict[str, float]:
     """Study 1 with and without noise under a tuning, by the criterion and by one a hundred times as strict."""
     t = tuning
     coordinates = PaperCoordinates(1, L, t.width, beta1=-t.beyond, beta2=L + t.beyond)
-    model = Model(study.robot, coordinates, scaled=False, tip_std=(t.tip_N, t.tip_Nm))
+    unknowns = Unknowns(coordinates, scaled=False)
     Q = torch.tensor([t.a, t.a, t.eta, t.c, *[t.n] * 3, *[t.m] * 3], dtype=torch.float64) ** 2
-    settings = replace(paper_settings(model), Q=Q, Sigma0=t.ratio**2 * Q)
     row = {}
     for name, noise in (("clean", 0.0), ("noise_1mm", NOISE)):
-        found = figures_of(estimate(model, study.noisy(noise, 1), NOISE, settings), study, 0.0)
+        problem = Problem(study.robot, unknowns, [study.noisy(noise, 1, NOISE)], tip_std=(t.tip_N, t.tip_Nm))
+        settings = replace(paper_settings(problem), Q=Q, Sigma0=t.ratio**2 * Q)
+        found = figures_of(estimate(problem, settings), study, 0.0)
         row |= {f"{name}_{k}": found[k] for k in ("converged", "accepted", "iterations_mean", "location_m_mean", "force_N_mean")}
         if found["accepted"] > HOPELESS:
             strict = replace(settings, gain=STRICT * settings.gain)
-            found = figures_of(estimate(model, study.noisy(noise, 1), NOISE, strict), study, 0.0)
+            found = figures_of(estimate(problem, strict), study, 0.0)
             row |= {f"{name}_strict_{k}": found[k] for k in ("accepted", "iterations_mean")}
         else:
             row |= {f"{name}_strict_accepted": 0.0, f"{name}_strict_iterations_mean": math.inf}

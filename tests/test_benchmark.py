@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from studies import peers
+from studies.benchmark import torchrod_path
 from studies.benchmark.agreement import Disagreement, Tolerance, fit_differences, linear_differences, verify
 from studies.benchmark.bars import bars, ratios, straight
 from studies.benchmark.cases import ITERATION, STUDY, write, write_frames
@@ -17,7 +18,6 @@ from studies.benchmark.report import BEGIN, END, generated, write_page
 from studies.benchmark.torchrod_path import TorchrodPeer, kernel_seconds
 from studies.benchmark.worker import Worker, timed
 
-import torchrod
 from torchrod import Estimate, kernel
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -202,13 +202,13 @@ def test_frames_go_through_an_estimator(folder, monkeypatch):
     film = str(write_frames(3, folder))
 
     class Frames:
-        def __init__(self, model, s, noise):
-            assert model.size == 10 and len(s) == 20 and noise == STUDY.noise
+        def __init__(self, robot, unknowns, s, noise):
+            assert unknowns.state(robot).size == 10 and len(s) == 20 and noise == STUDY.noise
 
         def __call__(self, positions):
             assert positions.shape == (20, 3)
 
-    monkeypatch.setattr(torchrod, "Estimator", Frames, raising=False)
+    monkeypatch.setattr(torchrod_path, "Tracker", Frames)
     assert len(worker.frames(film)["seconds"]) == 3
 
 

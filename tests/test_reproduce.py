@@ -11,7 +11,7 @@ import torch
 from studies.reproduction import paper_mode, printed_rows, study2
 
 from tests.robots import steel_rod
-from torchrod import PaperCoordinates, paper_settings
+from torchrod import Markers, PaperCoordinates, paper_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = {"I": (0.32, 0.0198), "II": (0.61, 0.0419), "III": (0.65, 0.0398)}  # mean errors of its printed rows, N and m
@@ -35,11 +35,11 @@ def check_tables(rows):
 
 
 def test_paper_mode_is_the_best_of_the_search():
-    """What paper_model and paper_settings have is what the table of the search says did best."""
+    """What paper_problem and paper_settings have is what the table of the search says did best."""
     with paper_mode.TABLE.open(newline="") as file:
         best = min((r for r in csv.DictReader(file) if r["stage"] == "check"), key=paper_mode.rank)
-    model = paper_mode.paper_model(steel_rod())
-    settings, c = paper_settings(model), model.coordinates
+    problem = paper_mode.paper_problem(steel_rod(), Markers(torch.tensor([0.4]), torch.zeros(1, 1, 3), 1e-3))
+    settings, c = paper_settings(problem), problem.unknowns.loads
     assert isinstance(settings.Q, torch.Tensor)
     assert isinstance(settings.Sigma0, torch.Tensor)
     assert isinstance(c, PaperCoordinates)
@@ -48,7 +48,7 @@ def test_paper_mode_is_the_best_of_the_search():
     assert torch.allclose((settings.Sigma0 / settings.Q).sqrt(), torch.tensor(float(best["ratio"])))
     assert c.width == float(best["width"])
     assert c.beta1 == -float(best["beyond"])
-    assert model.tip_std == (float(best["tip_N"]), float(best["tip_Nm"]))
+    assert problem.tip_std == (float(best["tip_N"]), float(best["tip_Nm"]))
 
 
 def test_study_2_stays_below_the_papers_limit():

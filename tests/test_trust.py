@@ -4,8 +4,7 @@ import pytest
 from matplotlib.figure import Figure
 from studies.trust import coverage, frame, markers, mistakes, unknown_noise
 
-from tests.problems import unknowns_of
-from torchrod import Estimate, Problem, estimate
+from torchrod import Estimate, estimate
 
 pytestmark = [pytest.mark.many_fits, pytest.mark.study]
 
@@ -28,7 +27,7 @@ def test_one_frame_for_many_shapes():
     true, clean = frame._cases(12)
     fit = frame._one_frame(12, 12, 3)
     assert isinstance(fit, Estimate)
-    alone = estimate(Problem(frame.ROBOT, unknowns_of(frame.ROBOT), [clean]))
+    alone = estimate(frame.posed(clean, frame.pushed(1)))
     for i in (0, 1):
         assert frame._errors(fit, true)[i] < 1.6 * frame._errors(alone, true)[i]
     axes = Figure().subplots()

@@ -18,16 +18,16 @@ from tqdm import tqdm
 from studies.reproduction.cases import L, steel_rod
 from torchrod import (
     GaussianCoordinates,
+    Hypothesis,
     Markers,
-    Model,
     PointForces,
     PointWrenches,
-    Settings,
-    cold_start,
-    find_warm_start,
+    Problem,
+    Unknowns,
+    select,
     solve_shape,
 )
-from torchrod.analysis.count import Hypothesis, select
+from torchrod.analysis.pipeline import learned_or_cold
 from torchrod.mechanics.loads import Load
 
 ROBOT = steel_rod()
@@ -77,11 +77,11 @@ def cases(truth: Truth, markers: int, samples: int, seed: int, noise: float = NO
     generator = torch.Generator().manual_seed(seed)
     s = torch.linspace(L / markers, L, markers, dtype=torch.float64)
     p = solve_shape(ROBOT, _loads(truth, samples, generator), None, s, samples, 80).p
-    return Markers(s, p + noise * torch.randn(p.shape, generator=generator, dtype=torch.float64))
+    return Markers(s, p + noise * torch.randn(p.shape, generator=generator, dtype=torch.float64), noise)
 
 
 def _hypothesis(name: str, contacts: int, prior: str = "contact", tip: str = "none") -> Hypothesis:
-    return Hypothesis(name, contacts, Model(ROBOT, GaussianCoordinates(contacts, L, ROBOT.rod.force_scale, prior), tip=tip))
+    return Hypothesis(name, contacts, Unknowns(GaussianCoordinates(contacts, L, ROBOT.rod.force_scale, prior), tip))
 
 
 COUNTS = [_hypothesis(str(k), k) for k in range(MOST + 1)]
@@ -93,13 +93,14 @@ WIDTHS = [
 ]
 
 
-def chosen(hypotheses: list[Hypothesis], markers: Markers, noise: float = NOISE) -> list[int]:
+def chosen(hypotheses: list[Hypothesis], markers: Markers) -> list[int]:
     """How many samples chose each hypothesis."""
 
     def bar(total: int, what: str) -> AbstractContextManager[tqdm]:
         return tqdm(total=total, desc=what, delay=1.0, leave=False)
 
-    _, evidence = select(hypotheses, markers, noise, Settings(), lambda model: find_warm_start(model) or cold_start, bar)
+    problem = Problem(ROBOT, hypotheses[0].unknowns, [markers])
+    _, evidence = select(problem, hypotheses, start=learned_or_cold, bar=bar)
     return torch.bincount(evidence.choice, minlength=len(hypotheses)).tolist()
 
 
@@ -141,7 +142,7 @@ def tips(samples: int) -> list[str]:
         )
     ):
         rows += [
-            (f"{what}, {1e3 * noise:g} mm", name, chosen(TIPS, cases(truth, 20, samples, 5000 + i, noise), noise))
+            (f"{what}, {1e3 * noise:g} mm", name, chosen(TIPS, cases(truth, 20, samples, 5000 + i, noise)))
             for noise in (1e-3, 2e-4)
         ]
     return _shares(rows, [h.name for h in TIPS], samples, "true, noise")
@@ -157,7 +158,7 @@ def widths(samples: int) -> list[str]:
         )
     ):
         rows += [
-            (f"{what}, {1e3 * noise:g} mm", name, chosen(WIDTHS, cases(truth, 20, samples, 6000 + i, noise), noise))
+            (f"{what}, {1e3 * noise:g} mm", name, chosen(WIDTHS, cases(truth, 20, samples, 6000 + i, noise)))
             for noise in (1e-3, 2e-4, 5e-5)
         ]
     return _shares(rows, [h.name for h in WIDTHS], samples, "true, noise")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from studies.reproduction.study2 import Study2
-from torchrod import GaussianCoordinates, Markers, Model, PointForces, Robot, solve_shape
+from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Robot, Unknowns, solve_shape
 from torchrod.estimation.starts import in_equilibrium
 
 MM = 1e-3
@@ -24,14 +24,12 @@ NEAREST_TIP = 0.999  # of the length: eta of a load at the very tip is infinite
 
 @dataclass(frozen=True)
 class Part:
-    """B samples of one model and one noise level (m): markers, true loads, and the oracle's start.
+    """B samples of one problem: what was measured, true loads, and the oracle's start.
 
     force (B, K, 2) N and location (B, K) m, by location; or the smooth loads of Study 2. oracle (B, n): x at the true loads.
     """
 
-    model: Model
-    markers: Markers
-    noise: float
+    problem: Problem
     truth: "tuple[Tensor, Tensor] | Study2"
     oracle: Tensor
 
@@ -91,20 +89,14 @@ def with_noise(positions: Tensor, noise: float, missing: int, seed: int) -> Tens
     return noisy.masked_fill(lost.unsqueeze(-1), torch.nan)
 
 
-def contact_model(robot: Robot, contacts: int) -> Model:
-    """The estimator's default: contacts of about L / 40."""
-    return Model(robot, GaussianCoordinates(contacts, robot.rod.length, robot.rod.force_scale))
-
-
-def contact_part(robot: Robot, markers: Markers, noise: float, force: Tensor, location: Tensor) -> Part:
-    """A part whose truth is point loads; its oracle knows them, and takes the prior's width."""
-    model = contact_model(robot, location.shape[1])
+def contact_part(robot: Robot, markers: Markers, force: Tensor, location: Tensor, tension: Tensor | None = None) -> Part:
+    """A part whose truth is point loads; its oracle knows them, and takes the prior's width. Contacts are of about L / 40."""
+    loads = GaussianCoordinates(location.shape[1], robot.rod.length, robot.rod.force_scale)
+    problem = Problem(robot, Unknowns(loads), [markers], tension)
     eta = torch.logit((location / robot.rod.length).clamp(max=NEAREST_TIP))
-    gamma = model.coordinates.start().unflatten(0, (*location.shape[1:], 4)).expand(*location.shape, 4).clone()
+    gamma = loads.start().unflatten(0, (*location.shape[1:], 4)).expand(*location.shape, 4).clone()
     gamma[..., :2], gamma[..., 2] = force / robot.rod.force_scale, eta
-    gamma = gamma.flatten(1)
-    oracle = in_equilibrium(model, gamma, markers)
-    return Part(model, markers, noise, (force, location), oracle)
+    return Part(problem, (force, location), in_equilibrium(problem, gamma.flatten(1)))
 
 
 def drawn(robot: Robot, draw: Draw, count: int, seed: int) -> Part:
@@ -118,5 +110,5 @@ def drawn(robot: Robot, draw: Draw, count: int, seed: int) -> Part:
     tension = draw.tension * u(count, len(robot.tendons)) if len(robot.tendons) else None
     shape = solve_shape(robot, (PointForces(force, place),), tension, s, count, STEPS)
     solved = (shape.status == 0).nonzero().squeeze(-1)
-    markers = Markers(s, with_noise(shape.p, draw.noise, draw.missing, seed + 1), None, tension).take(solved)
-    return contact_part(robot, markers, draw.noise, force[solved, :, :2], place[solved])
+    markers = Markers(s, with_noise(shape.p, draw.noise, draw.missing, seed + 1), draw.noise).take(solved)
+    return contact_part(robot, markers, force[solved, :, :2], place[solved], None if tension is None else tension[solved])

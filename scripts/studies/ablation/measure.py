@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -10,14 +10,15 @@ from torch import Tensor
 
 from studies.reproduction.cases import L
 from studies.reproduction.study2 import force_error
-from torchrod import Estimate, Markers, Model, Settings, Start, Status, WarmStart, cold_start, estimate, find_warm_start
+from torchrod import Estimate, Origin, Problem, Settings, Start, Status, WarmStart, cold_start, estimate, find_warm_start
 from torchrod.estimation import filter as ekf
 from torchrod.estimation.at_rest import at_rest
-from torchrod.estimation.evaluator import Prepared
-from torchrod.estimation.solve import CHUNK, CHUNK_TORCH, linearize
-from torchrod.estimation.starts import StartRule, better_start, cold_from, costs_in_equilibrium
-from torchrod.kernel import Sums, available
+from torchrod.estimation.evaluator import evaluator
+from torchrod.estimation.solve import CHUNK, CHUNK_TORCH, Filter, linearize
+from torchrod.estimation.starts import StartRule, challenged_by_cold, cold_from
+from torchrod.kernel import available
 from torchrod.learned.features import features
+from torchrod.learned.warm_start import _costs
 from torchrod.mechanics.loads import Load
 
 from .cases import Case, Part
@@ -51,8 +52,9 @@ class Run:
 
 
 def starts(part: Part) -> dict[str, StartRule | Start]:
-    """Where to start. Where no checkpoint serves the model, warm is cold, as in the command line."""
-    return {"cold": cold_start, "warm": find_warm_start(part.model) or cold_start, "oracle": Start.known(part.oracle)}
+    """Where to start. Where no checkpoint serves the problem, warm is cold, as in the command line."""
+    warm = find_warm_start(part.problem) or cold_start
+    return {"cold": cold_start, "warm": warm, "oracle": Start.at(part.oracle, Origin.OTHER_FIT)}
 
 
 def chunks(count: int) -> list[Tensor]:
@@ -62,7 +64,7 @@ def chunks(count: int) -> list[Tensor]:
 
 def fitted(part: Part, start: StartRule | Start) -> Estimate:
     """All samples of a part from one start."""
-    return estimate(part.model, part.markers, part.noise, start=start)
+    return estimate(part.problem, start=start)
 
 
 def centroid(load: Load) -> Tensor:
@@ -80,21 +82,21 @@ def errors(part: Part, fit: Estimate) -> tuple[Tensor, Tensor]:
     Study 2: of the centroid of the load, and RMS over s of the load carried up to s.
     """
     if not isinstance(part.truth, tuple):
-        (load,) = part.model.coordinates.loads(part.model.split(fit.x.nan_to_num(0.0))[0])
-        return (centroid(load) - centroid(part.truth.load)).abs(), force_error(fit, part.truth, part.model)
+        problem = part.problem
+        (load,) = problem.unknowns.loads.loads(problem.state.loads.of(fit.x.nan_to_num(0.0)))
+        return (centroid(load) - centroid(part.truth.load)).abs(), force_error(fit, part.truth, problem)
     force, location = part.truth
     order = fit.location.argsort(-1)
     off = fit.magnitude.gather(1, order) - force.norm(dim=-1)
     return (fit.location.gather(1, order) - location).abs().mean(-1), off.abs().mean(-1)
 
 
-def fully_iterated(model: Model, markers: Markers, noise: float, x: Tensor) -> Tensor:
+def fully_iterated(problem: Problem, x: Tensor) -> Tensor:
     """The cost (B,) after FURTHER iterations more from x: Gauss-Newton with Levenberg's damping, which can only go down.
 
     Not the filter, which would stop at once, and without its test. Samples with nothing more to gain drop out.
     """
-    w = model.weights(markers, noise)
-    eye = torch.eye(model.size, dtype=x.dtype)
+    eye = torch.eye(problem.size, dtype=x.dtype)
     lowest, damping = torch.full_like(x[:, 0], torch.inf), torch.ones_like(x[:, 0])
     base, step = x.clone(), torch.zeros_like(x)
     live = torch.arange(len(x))
@@ -102,7 +104,7 @@ def fully_iterated(model: Model, markers: Markers, noise: float, x: Tensor) -> T
         if not len(live):
             break
         onward = base[live] + step[live]
-        at = linearize(model, onward, markers.take(live), w[live])
+        at = linearize(problem.take(live), onward)
         lower = at.cost < lowest[live]
         done = lower & (at.decrement < SETTLED)
         lowest[live] = torch.where(lower, at.cost, lowest[live])
@@ -120,9 +122,8 @@ def excess(part: Part, fit: Estimate) -> Tensor:
     x = torch.where(torch.isfinite(fit.x), fit.x, part.oracle)
     above = []
     for i in chunks(len(x)):
-        markers = part.markers.take(i)
-        reached = Prepared(part.model, markers, part.model.weights(markers, part.noise)).cost(x[i])
-        above.append(reached - fully_iterated(part.model, markers, part.noise, x[i]))
+        problem = part.problem.take(i)
+        above.append(evaluator(problem).cost(x[i]) - fully_iterated(problem, x[i]))
     return torch.where(fit.status == Status.CONVERGED, torch.cat(above), torch.nan)
 
 
@@ -164,36 +165,39 @@ def start_times(part: Part) -> dict[str, float]:
     the cold start that this needs, the forward solve under the guessed load, and network and check; a cold start alone; one filter
     iteration.
     """
-    model, noise = part.model, part.noise
-    markers = part.markers.take(torch.arange(TIMED_BATCH) % len(part.oracle))
-    warm, w = find_warm_start(model) or cold_start, model.weights(markers, noise)
-    x = part.oracle[torch.arange(TIMED_BATCH) % len(part.oracle)]
-    Sigma0, Q = Settings().initial_covariance(x), torch.ones(model.size, dtype=x.dtype)
-    many, none = Sigma0.repeat(len(x), 1, 1), torch.zeros(len(x), dtype=torch.bool)
-    at = ekf.Iterate(x.clone(), many.clone(), x.clone(), torch.full_like(x[:, 0], torch.inf), none)
-    once = Prepared(model, markers, w).iteration(at, many, Q, ekf.Limits(), Sums.room(len(x), model.size, len(markers.s)))
+    these = torch.arange(TIMED_BATCH) % len(part.oracle)
+    problem, x, settings = part.problem.take(these), part.oracle[these], Settings()
+    warm, Sigma0 = find_warm_start(problem) or cold_start, settings.initial_covariance(x)
+    once = evaluator(problem).iteration(Filter(settings).init(problem, Start.at(x, Origin.OTHER_FIT)), ekf.Limits())
+
+    def afresh() -> Problem:
+        """As an estimate begins: nothing has been worked out yet."""
+        return replace(problem)
+
+    def better_of(problem: Problem) -> object:
+        return challenged_by_cold(problem, warm(problem), Sigma0)
 
     found = {
-        "start_s": best_of(lambda: better_start(model, markers, noise, warm(model, markers, noise), Sigma0)),
-        "cold_s": best_of(lambda: cold_start(model, markers, noise)),
+        "start_s": best_of(lambda: better_of(afresh())),
+        "cold_s": best_of(lambda: cold_start(afresh())),
         "iteration_s": best_of(lambda: once(torch.arange(len(x)))),
     }
     if not isinstance(warm, WarmStart):
         return found | {"read_s": 0.0, "solve_s": 0.0, "network_s": 0.0}
-    guess = warm(model, markers, noise)
-    gamma, index = model.split(guess.x)[0], guess.warm.nonzero().squeeze(-1)
-    loaded, read = markers.take(index), features(model, markers, noise).take(index)
-    rest = at_rest(model, loaded, gamma[index], read.q_tip)
+    guess = warm(problem)
+    gamma, index = problem.state.loads.of(guess.x), guess.challenged.nonzero().squeeze(-1)
+    loaded, read = problem.take(index), features(problem).take(index)
+    rest = at_rest(loaded, gamma[index], read.q_tip)
 
     def network_and_check() -> None:
-        warm.guess(model, read)
-        states = torch.stack([guess.x[index], cold_from(model, read.alpha)], 1)
-        costs_in_equilibrium(model, loaded, noise, states, torch.stack([rest.p, read.p0], 1))
-        better_start(model, markers, noise, guess, Sigma0)
+        warm.guess(loaded, read)
+        states = torch.stack([guess.x[index], cold_from(loaded, read.alpha)], 1)
+        _costs(loaded, states, torch.stack([rest.p, read.p0], 1))
+        challenged_by_cold(problem, guess, Sigma0)
 
     return found | {
-        "read_s": best_of(lambda: features(model, markers, noise)),
-        "solve_s": best_of(lambda: at_rest(model, loaded, gamma[index], read.q_tip)),
+        "read_s": best_of(lambda: features(afresh())),
+        "solve_s": best_of(lambda: at_rest(loaded, gamma[index], read.q_tip)),
         "network_s": best_of(network_and_check),
     }
 

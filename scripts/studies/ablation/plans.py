@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,7 @@ from studies.reproduction.cases import study1 as draw_study1
 from studies.reproduction.study2 import Study2
 from studies.reproduction.study2 import study2 as draw_study2
 from studies.reproduction.twins import MARKERS, one_tendon, two_tendons
-from torchrod import GaussianCoordinates, Markers, Model, Robot, Rod, Tendon, Tendons, cold_start, estimate
+from torchrod import GaussianCoordinates, Markers, Problem, Robot, Rod, Tendon, Tendons, Unknowns, cold_start, estimate
 
 from .cases import MM, SEED, Case, Draw, Part, between, contact_part, drawn, log_between, with_noise
 
@@ -27,27 +27,29 @@ REFERENCE = Path(__file__).resolve().parents[3] / "tests" / "data" / "shape_refe
 def study1_part(noise: float, count: int) -> Part:
     """Study 1 of the paper, other draws than in docs/reproduction.md."""
     study = draw_study1(count, SEED)
-    markers = Markers(S, with_noise(study.positions, noise, 0, SEED + 1))
-    return contact_part(study.robot, markers, noise or TOLD_CLEAN, study.force.unsqueeze(1), study.location.unsqueeze(1))
+    markers = Markers(S, with_noise(study.positions, noise, 0, SEED + 1), noise or TOLD_CLEAN)
+    return contact_part(study.robot, markers, study.force.unsqueeze(1), study.location.unsqueeze(1))
 
 
 @cache
-def study2_oracle(count: int) -> tuple[Study2, Model, Tensor]:
-    """Study 2, the model of three Gaussians, and the oracle's x (B, n).
+def study2_oracle(count: int) -> tuple[Study2, Problem, Tensor]:
+    """Study 2, the problem of three Gaussians with markers without noise, and the oracle's x (B, n).
 
     Three Gaussians cannot be the true load, so the oracle starts from the fit to markers without noise, told 1 mm: the best that
     could be known beforehand. (Told the clean case's 0.1 mm it would be that case's answer.)
     """
     study = draw_study2(count, SEED + 2)
     rod = study.robot.rod
-    model = Model(study.robot, GaussianCoordinates(3, rod.length, rod.force_scale, "distributed"))
-    return study, model, estimate(model, Markers(S, study.positions), MM, start=cold_start).x
+    unknowns = Unknowns(GaussianCoordinates(3, rod.length, rod.force_scale, "distributed"))
+    problem = Problem(study.robot, unknowns, [Markers(S, study.positions, MM)])
+    return study, problem, estimate(problem, start=cold_start).x
 
 
 def study2_part(noise: float, count: int) -> Part:
     """Study 2 with three Gaussians."""
-    study, model, oracle = study2_oracle(count)
-    return Part(model, Markers(S, with_noise(study.positions, noise, 0, SEED + 3)), noise or TOLD_CLEAN, study, oracle)
+    study, problem, oracle = study2_oracle(count)
+    markers = Markers(S, with_noise(study.positions, noise, 0, SEED + 3), noise or TOLD_CLEAN)
+    return Part(replace(problem, sensors=[markers]), study, oracle)
 
 
 def nitinol() -> Robot:
@@ -89,9 +91,9 @@ def reference_part(shape: dict[str, Any], draws: int, seed: int) -> Part:
 
     points = sorted(shape["points"], key=lambda p: p["s"])
     tension = tensor(shape["tensions"]) if shape["tensions"] else None
-    markers = Markers(tensor(shape["s"])[0], with_noise(tensor(shape["positions"]), MM, 0, seed), None, tension)
+    markers = Markers(tensor(shape["s"])[0], with_noise(tensor(shape["positions"]), MM, 0, seed), MM)
     force, location = tensor([[p["fx"], p["fy"]] for p in points]), tensor([p["s"] for p in points])
-    return contact_part(reference_robot(shape["robot"]), markers, MM, force, location)
+    return contact_part(reference_robot(shape["robot"]), markers, force, location, tension)
 
 
 def joined(parts: list[Part]) -> list[Part]:
@@ -102,19 +104,20 @@ def joined(parts: list[Part]) -> list[Part]:
 
 def alike(a: Part, b: Part) -> bool:
     """Whether two parts may share a batch."""
-    one, two = a.model.robot, b.model.robot
+    one, two = a.problem.robot, b.problem.robot
     same_rod = one.rod.length == two.rod.length and torch.equal(one.rod.K_bt, two.rod.K_bt)
-    return same_rod and len(one.tendons) == len(two.tendons) and a.model.size == b.model.size
+    return same_rod and len(one.tendons) == len(two.tendons) and a.problem.size == b.problem.size
 
 
 def _cat(parts: list[Part]) -> Part:
-    first = parts[0]
-    tensions = [p.markers.tension for p in parts if p.markers.tension is not None]
-    positions = torch.cat([p.markers.positions for p in parts])
-    markers = Markers(first.markers.s, positions, None, torch.cat(tensions) if tensions else None)
+    first = parts[0].problem
+    tensions = [p.problem.tension for p in parts if p.problem.tension is not None]
+    seen = [markers for p in parts if (markers := p.problem.markers) is not None]
+    markers = replace(seen[0], positions=torch.cat([m.positions for m in seen]))
+    problem = replace(first, sensors=[markers], tension=torch.cat(tensions) if tensions else None)
     truths = [p.truth for p in parts if isinstance(p.truth, tuple)]
     truth = (torch.cat([t[0] for t in truths]), torch.cat([t[1] for t in truths]))
-    return Part(first.model, markers, first.noise, truth, torch.cat([p.oracle for p in parts]))
+    return Part(problem, truth, torch.cat([p.oracle for p in parts]))
 
 
 def reference_parts(draws: int) -> tuple[Part, ...]:

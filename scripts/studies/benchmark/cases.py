@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torchrod.model.measurement import TURN_SCALE
 
-from studies.peers import Problem
+from studies import peers
 from studies.reproduction.cases import steel_rod
-from torchrod import GaussianCoordinates, Model, PointForces, solve_shape
+from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Registration, Unknowns, solve_shape
 from torchrod.mechanics.statics import grid_for
+from torchrod.model.unknowns import TURN_SCALE
 
 DISTINCT = 256  # different samples; larger batches repeat them
 OFF = 0.1  # how far from the truth, in units of x, an iteration is timed
@@ -36,11 +36,15 @@ class Case:
         """For a file."""
         return f"{self.loads}_{int(self.registration)}_{self.markers}_{self.steps}"
 
-    def model(self) -> Model:
+    def unknowns(self) -> Unknowns:
         """torchrod's, with the width prior of a contact."""
-        robot = steel_rod()
-        coordinates = GaussianCoordinates(self.loads, robot.rod.length, robot.rod.force_scale)
-        return Model(robot, coordinates, self.registration, steps=self.steps)
+        rod = steel_rod().rod
+        loads = GaussianCoordinates(self.loads, rod.length, rod.force_scale)
+        return Unknowns(loads, registration=Registration() if self.registration else None)
+
+    def problem(self, positions: torch.Tensor) -> Problem:
+        """torchrod's, of markers at these positions (B, P, 3) m."""
+        return Problem(steel_rod(), self.unknowns(), [Markers(self.markers_at(), positions, self.noise)], steps=self.steps)
 
     def markers_at(self) -> torch.Tensor:
         """Evenly spaced to the tip, (P,) m."""
@@ -52,13 +56,11 @@ ITERATION = Case()  # 16 unknowns
 STUDY = Case(registration=False)  # Study 1 of the paper, 10 unknowns
 
 
-def problem(case: Case) -> Problem:
+def as_peers(problem: Problem, case: Case) -> peers.Problem:
     """As the peers want it."""
-    model, s = case.model(), case.markers_at()
-    rod, (mean, precision) = model.robot.rod, model.prior()
-    grid = grid_for(model.robot, (), s, case.steps)
+    rod, grid = problem.robot.rod, grid_for(problem.robot, (), problem.s, case.steps)
     compliance = 1 / torch.cat([rod.K_se.diagonal(), rod.K_bt.diagonal()])
-    return Problem(
+    return peers.Problem(
         loads=case.loads,
         registration=case.registration,
         length=rod.length,
@@ -69,10 +71,10 @@ def problem(case: Case) -> Problem:
         moment_scale=rod.moment_scale,
         shift=TURN_SCALE * rod.length,
         turn=TURN_SCALE,
-        prior_mean=mean.numpy(),
-        prior_precision=precision.numpy(),
+        prior_mean=problem.mean.numpy(),
+        prior_precision=problem.precision.numpy(),
         noise=case.noise,
-        tip_precision=model.tip_weights(s).numpy(),
+        tip_precision=problem.tip_weights.numpy(),
     )
 
 
@@ -87,16 +89,17 @@ def write(case: Case, folder: Path) -> Path:
     size, angle = 0.5 + 0.5 * size, 2 * math.pi * angle
     place = 0.1 + 0.29 * (torch.arange(case.loads) + place) / case.loads
     force = torch.stack([size * angle.cos(), size * angle.sin(), 0 * size], -1)
-    model = case.model()
-    shape = solve_shape(model.robot, (PointForces(force, place),), None, case.markers_at(), DISTINCT, 160)
-    gamma = model.coordinates.start().reshape(-1, 4).repeat(DISTINCT, 1, 1)
-    start = model.join(gamma.flatten(1), torch.zeros(DISTINCT, 6, dtype=torch.float64))
-    gamma[..., :2] = force[..., :2] / model.robot.rod.force_scale
-    gamma[..., 2] = torch.logit(place / model.robot.rod.length)
-    near = model.join(gamma.flatten(1), shape.base_wrench)
+    robot = steel_rod()
+    shape = solve_shape(robot, (PointForces(force, place),), None, case.markers_at(), DISTINCT, 160)
+    problem = case.problem(shape.p)
+    gamma = problem.unknowns.loads.start().reshape(-1, 4).repeat(DISTINCT, 1, 1)
+    start = problem.state.join(gamma.flatten(1), torch.zeros(DISTINCT, 6, dtype=torch.float64))
+    gamma[..., :2] = force[..., :2] / robot.rod.force_scale
+    gamma[..., 2] = torch.logit(place / robot.rod.length)
+    near = problem.state.join(gamma.flatten(1), shape.base_wrench)
     near = near + OFF * torch.randn(near.shape, generator=generator, dtype=torch.float64)
     seen = shape.p + case.noise * torch.randn(shape.p.shape, generator=generator, dtype=torch.float64)
-    problem(case).save(path, near=near.numpy(), start=start.numpy(), positions=seen.numpy())
+    as_peers(problem, case).save(path, near=near.numpy(), start=start.numpy(), positions=seen.numpy())
     return path
 
 
@@ -109,8 +112,8 @@ def write_frames(count: int, folder: Path) -> Path:
     t = torch.arange(count, dtype=torch.float64) / FRAMES_A_CYCLE * 2 * math.pi
     place, size, angle = 0.25 + 0.1 * t.sin(), 0.75 + 0.2 * (1.7 * t).sin(), 0.3 * t
     force = torch.stack([size * angle.cos(), size * angle.sin(), 0 * size], -1)
-    model, s = STUDY.model(), STUDY.markers_at()
-    p = solve_shape(model.robot, (PointForces(force[:, None], place[:, None]),), None, s, count, 160).p
+    load = PointForces(force[:, None], place[:, None])
+    p = solve_shape(steel_rod(), (load,), None, STUDY.markers_at(), count, 160).p
     p = p + STUDY.noise * torch.randn(p.shape, generator=generator, dtype=torch.float64)
-    problem(STUDY).save(path, positions=p.numpy())
+    as_peers(STUDY.problem(p), STUDY).save(path, positions=p.numpy())
     return path

@@ -162,7 +162,7 @@ def estimates(processes: dict[str, Process], plan: Plan, folder: Path, progress:
 
 
 def single(processes: dict[str, Process], plan: Plan, folder: Path, progress: Progress) -> dict[str, Any]:
-    """One sample: frames through torchrod.Estimator, and whole estimates of a batch of one."""
+    """One sample: frames through torchrod.Tracker, and whole estimates of a batch of one."""
     progress("single frames")
     seconds = processes["torchrod"].ask("frames", data=str(write_frames(plan.frames, folder)))["seconds"]
     later = torch.tensor(seconds[1:], dtype=torch.float64)

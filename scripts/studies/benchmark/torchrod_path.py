@@ -1,16 +1,18 @@
 """torchrod itself, behind the peers' interface. Which of its paths runs is a matter of the environment (`paths`)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from studies.peers import Fit, Problem
-from torchrod import Estimate, Estimator, Markers, Settings, cold_start, estimate, find_warm_start, kernel
+from studies import peers
+from studies.reproduction.cases import steel_rod
+from torchrod import Estimate, Origin, Problem, Settings, Start, Tracker, cold_start, estimate, find_warm_start, kernel
 from torchrod.estimation import filter as ekf
-from torchrod.estimation.evaluator import Prepared
-from torchrod.estimation.solve import CHUNK
+from torchrod.estimation.evaluator import evaluator
+from torchrod.estimation.solve import CHUNK, Filter
 
 from .cases import Case
 
@@ -18,21 +20,19 @@ from .cases import Case
 class TorchrodPeer:
     """torchrod on one case."""
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: peers.Problem):
         self.case = Case(problem.loads, problem.registration, len(problem.keep), _steps(problem), problem.noise)
-        self.model, self.s = self.case.model(), self.case.markers_at()
         self._given: tuple[np.ndarray, ...] = ()  # the arrays that `iterate` was made ready for, and what it then calls
         self._calls: list[Callable[[], object]] = []
         self._before = self._done = np.empty(0)
 
-    def markers(self, positions: np.ndarray) -> Markers:
+    def problem(self, positions: np.ndarray) -> Problem:
         """Of some samples."""
-        return Markers(self.s, torch.from_numpy(positions))
+        return self.case.problem(torch.from_numpy(positions))
 
     def linearize(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `peers.Peer`."""
-        nowhere = torch.zeros(len(x), len(self.s), 3, dtype=torch.float64)
-        h, H = self.model.linearized(torch.from_numpy(x), Markers(self.s, nowhere))
+        h, H = self.problem(np.zeros((len(x), self.case.markers, 3))).linearized(torch.from_numpy(x))
         return h.numpy(), H.numpy()
 
     def iterate(self, x: np.ndarray, Sigma: np.ndarray, cap: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -53,29 +53,27 @@ class TorchrodPeer:
         This is what the tables call an iteration: h, H, the normal equations and the update. What is prepared once for all
         iterations of a fit is not in it.
         """
-        markers, n = self.markers(positions), self.model.size
-        at = ekf.Iterate(*(torch.from_numpy(a) for a in state))
-        Sigma0, sums = torch.eye(n, dtype=torch.float64).repeat(len(at.x), 1, 1), kernel.Sums.room(len(at.x), n, len(self.s))
-        prepared = Prepared(self.model, markers, self.model.weights(markers, self.case.noise))
-        once, index = prepared.iteration(at, Sigma0, torch.ones_like(at.x[0]), ekf.Limits(), sums), torch.arange(len(at.x))
+        problem, at = self.problem(positions), ekf.Iterate(*(torch.from_numpy(a) for a in state))
+        run = replace(Filter(Settings()).init(problem, Start.at(at.x, Origin.OTHER_FIT)), at=at)
+        once, index = evaluator(problem).iteration(run, ekf.Limits()), torch.arange(len(at.x))
         return lambda: once(index)
 
-    def estimate(self, x: np.ndarray, positions: np.ndarray) -> Fit:
+    def estimate(self, x: np.ndarray, positions: np.ndarray) -> peers.Fit:
         """See `peers.Peer`, for the comparison of answers: all steps fine, as the peers', so that the iterations are the same.
 
         torchrod chooses its own cold start, which is x on this rod.
         """
-        return as_fit(estimate(self.model, self.markers(positions), self.case.noise, Settings(coarse=False)))
+        return as_fit(estimate(self.problem(positions), Settings(coarse=False)))
 
     def fitted(self, start: str, positions: np.ndarray) -> Estimate:
         """Markers to loads with covariance, everything included, from a "cold" or a "warm" start."""
-        rule = (find_warm_start(self.model) if start == "warm" else None) or cold_start
-        return estimate(self.model, self.markers(positions), self.case.noise, start=rule)
+        problem = self.problem(positions)
+        return estimate(problem, start=(find_warm_start(problem) if start == "warm" else None) or cold_start)
 
     def frame_estimator(self) -> Callable[[np.ndarray], Any]:
         """One frame (P, 3) to its estimate, warm-started from what was before."""
-        estimator = Estimator(self.model, self.s, self.case.noise)
-        return lambda positions: estimator(torch.from_numpy(positions))
+        tracker = Tracker(steel_rod(), self.case.unknowns(), self.case.markers_at(), self.case.noise)
+        return lambda positions: tracker(torch.from_numpy(positions))
 
 
 def kernel_seconds() -> float:
@@ -83,12 +81,12 @@ def kernel_seconds() -> float:
     return kernel.seconds()
 
 
-def as_fit(fit: Estimate) -> Fit:
+def as_fit(fit: Estimate) -> peers.Fit:
     """As the peers report it."""
     parts = (fit.x, fit.covariance, fit.force, fit.location, fit.iterations, fit.status == 0, fit.chi2)
-    return Fit(*(part.numpy() for part in parts))
+    return peers.Fit(*(part.numpy() for part in parts))
 
 
-def _steps(problem: Problem) -> int:
+def _steps(problem: peers.Problem) -> int:
     """The number of steps asked for: a node at every marker and no step longer than L / steps."""
     return round(problem.length / float(np.diff(problem.nodes).max()))

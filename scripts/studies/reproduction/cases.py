@@ -6,7 +6,19 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchrod import Estimate, GaussianCoordinates, Markers, Model, PointForces, Robot, Rod, estimate, load_bound, solve_shape
+from torchrod import (
+    Estimate,
+    GaussianCoordinates,
+    Markers,
+    PointForces,
+    Problem,
+    Robot,
+    Rod,
+    Unknowns,
+    estimate,
+    load_bound,
+    solve_shape,
+)
 
 L = 0.4
 S = torch.linspace(0.02, L, 20, dtype=torch.float64)
@@ -32,19 +44,23 @@ class Study:
         parts = (self.force, self.location, self.positions, self.base_wrench)
         return Study(self.robot, *(x.repeat(times, *[1] * (x.ndim - 1)) for x in parts))
 
-    def noisy(self, noise: float, seed: int) -> Markers:
-        """Markers with Gaussian noise (m) on every coordinate."""
-        generator = torch.Generator().manual_seed(seed)
-        return Markers(S, self.positions + noise * torch.randn(self.positions.shape, generator=generator, dtype=torch.float64))
+    def noisy(self, noise: float, seed: int, told: float | None = None) -> Markers:
+        """Markers with Gaussian noise (m) on every coordinate. told: what they state (m), where that is another."""
+        draw = torch.randn(self.positions.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        return Markers(S, self.positions + noise * draw, noise if told is None else told)
 
-    def estimate(self, markers: Markers, sigma: float, prior: str) -> Estimate:
+    def problem(self, markers: Markers, prior: str = "contact") -> Problem:
+        """The default unknowns with a width prior."""
+        return Problem(self.robot, Unknowns(GaussianCoordinates(1, L, self.robot.rod.force_scale, prior)), [markers])
+
+    def estimate(self, markers: Markers, prior: str) -> Estimate:
         """The default estimator with a width prior."""
-        return estimate(Model(self.robot, GaussianCoordinates(1, L, self.robot.rod.force_scale, prior)), markers, sigma)
+        return estimate(self.problem(markers, prior))
 
     def bound(self, noise: float, width_known: bool) -> tuple[Tensor, Tensor]:
         """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N)."""
-        markers = Markers(S, self.positions)
-        return load_bound(self.robot, markers, self.force, self.location, self.base_wrench, noise, width_known=width_known)
+        markers = Markers(S, self.positions, noise)
+        return load_bound(self.robot, markers, self.force, self.location, self.base_wrench, width_known=width_known)
 
 
 def mean_error(bounds: list[float]) -> float:

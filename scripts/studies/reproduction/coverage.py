@@ -16,7 +16,7 @@ THIRDS = ((0.1, 0.2), (0.2, 0.3), (0.3, 0.39))
 def run(quick: bool, folder: Path) -> tuple[dict[str, float], list[str]]:
     """1,000 runs with 1 mm noise and the point-like prior: joint region of (force, location), and each interval."""
     study = study1(100 if quick else 1000, seed=7)
-    fit = study.estimate(study.noisy(NOISE, 11), NOISE, "point")
+    fit = study.estimate(study.noisy(NOISE, 11), "point")
     size, estimated = study.force.norm(dim=-1), fit.force[:, 0]
     turn = torch.atan2(study.force[:, 0] * estimated[:, 1] - study.force[:, 1] * estimated[:, 0], (study.force * estimated).sum(-1))
     error = torch.stack([torch.log(fit.magnitude[:, 0] / size), turn, torch.log(fit.location[:, 0] / study.location)], -1)

@@ -7,7 +7,6 @@ import torch
 from torchrod import (
     GaussianCoordinates,
     Markers,
-    Model,
     PaperCoordinates,
     PointForces,
     Robot,
@@ -15,21 +14,23 @@ from torchrod import (
     Settings,
     Tendon,
     Tendons,
+    cold_start,
     estimate,
     load_bound,
     paper_settings,
     solve_shape,
 )
 from torchrod.estimation import filter as ekf
-from torchrod.estimation.solve import cold_start, linearize
+from torchrod.estimation.solve import linearize
 from torchrod.mechanics.lie import rotate
 
 from .cases import L, S, Study, steel_rod, study1
-from .paper_mode import paper_model
+from .paper_mode import paper_problem
 
 OFFSET = 0.007  # m, of the tendon of the one-tendon robot (tests/data/shape_reference.json)
 PULLED = {"cm": 0.115, "mm": 0.0115}  # m of tendon: the largest actuation of the tables, read as cm and as mm
 CASE = 11  # of Study 1: the paper's own recursion converges on it
+TOLD = 1e-3  # m: the noise that markers without noise state
 CHOICES = {  # which Sigma_bar stands in front of H^T in the gain, and inside it: 0 this step's, -1 the step before's
     "i in front, i inside (right)": (0, 0),
     "i - 1 in front, i inside (printed)": (-1, 0),
@@ -59,20 +60,19 @@ def shape_innovation(study: Study, paper: bool, iterations: int) -> dict[str, li
 
     paper: gamma = [a, eta, c] and the plain recursion; otherwise our coordinates with steps of at most 0.6.
     """
-    ours = Model(study.robot, GaussianCoordinates(1, L, study.robot.rod.force_scale))
-    model = paper_model(study.robot) if paper else ours
-    settings = paper_settings(model) if paper else Settings()
-    markers = study.noisy(0.0, 1).take(torch.tensor([CASE]))
-    w, one, prior = model.weights(markers, 1e-3), torch.ones(model.size, dtype=torch.float64), model.prior()
+    markers = study.noisy(0.0, 1, TOLD).take(torch.tensor([CASE]))
+    problem = paper_problem(study.robot, markers) if paper else study.problem(markers)
+    settings = paper_settings(problem) if paper else Settings()
+    one = torch.ones(problem.size, dtype=torch.float64)
     residuals: dict[str, list[float | None]] = {}
     for name, sign in (("z - h", 1.0), ("h - z", -1.0)):
-        x, Sigma = cold_start(model, markers, 1e-3).x, torch.diag(settings.Sigma0 * one).unsqueeze(0)
+        x, Sigma = cold_start(problem).x, torch.diag(settings.Sigma0 * one).unsqueeze(0)
         residuals[name] = []
         for _ in range(iterations):
-            at = linearize(model, x, markers, w)
+            at = linearize(problem, x)
             size = 1e3 * float((at.r[:, :-6].square().sum() / len(S)).sqrt())
             residuals[name].append(size if math.isfinite(size) else None)
-            A, g = ekf.information(at.H, sign * at.r, w, x, *prior)
+            A, g = ekf.information(at.H, sign * at.r, problem.weights, x, problem.mean, problem.precision)
             step, Sigma = ekf.update(ekf.predict(Sigma, settings.Q * one), A, g)
             x = x + step * (settings.step_limit / step.abs().max()).clamp(max=1.0)
     return residuals
@@ -101,14 +101,12 @@ def index_choices() -> dict[str, float]:
 
 def damping(study: Study, powers: tuple[float, ...], count: int) -> dict[str, dict[str, float]]:
     """Per Q, over `count` cases: the mean first step from one start with Sigma_0 = 0, and the mean iterations (at most 200)."""
-    model = Model(study.robot, GaussianCoordinates(1, L, study.robot.rod.force_scale))
-    markers = study.noisy(0.0, 1).take(torch.arange(count))
-    x = cold_start(model, markers, 1e-3).x
-    at = linearize(model, x, markers, model.weights(markers, 1e-3))
+    problem = study.problem(study.noisy(0.0, 1, TOLD).take(torch.arange(count)))
+    at = linearize(problem, cold_start(problem).x)
     rows = {}
     for Q in powers:
-        step, _ = ekf.update(ekf.predict(torch.zeros_like(at.A), Q * torch.ones(model.size, dtype=x.dtype)), at.A, at.g)
-        fit = estimate(model, markers, 1e-3, Settings(1.0, Q, max_iterations=200, restarts=()))
+        step, _ = ekf.update(ekf.predict(torch.zeros_like(at.A), Q * torch.ones(problem.size, dtype=torch.float64)), at.A, at.g)
+        fit = estimate(problem, Settings(1.0, Q, max_iterations=200, restarts=()))
         rows[f"{Q:g}"] = {
             "step": float(step.norm(dim=-1).mean()),
             "iterations": float(fit.iterations.double().mean()),
@@ -119,11 +117,10 @@ def damping(study: Study, powers: tuple[float, ...], count: int) -> dict[str, di
 
 def undamped(study: Study, powers: tuple[float, ...]) -> dict[str, dict[str, float]]:
     """Per Q, in our coordinates without step limit and adaptive noise: share converged and their mean iterations (at most 500)."""
-    model = Model(study.robot, GaussianCoordinates(1, L, study.robot.rod.force_scale))
-    rows = {}
+    problem, rows = study.problem(study.noisy(0.0, 1, TOLD)), {}
     for Q in powers:
         settings = Settings(1.0, Q, step_limit=math.inf, adaptive=False, coarse=False, max_iterations=500, restarts=())
-        fit = estimate(model, study.noisy(0.0, 1), 1e-3, settings)
+        fit = estimate(problem, settings)
         done = fit.status == 0
         rows[f"{Q:g}"] = {"iterations": float(fit.iterations[done].double().mean()), "converged": float(done.double().mean())}
     return rows
@@ -180,7 +177,7 @@ def points() -> dict[str, float]:
     found = {"discs": float(len(s)), "length_m": float(s[-1]), "location_m": float(study.location[0])}
     for name, places in (("nine", s), ("eight", s[1:])):
         shape = solve_shape(study.robot, (load,), None, places, 1)
-        bound = load_bound(study.robot, Markers(places, shape.p), study.force, study.location, study.base_wrench, 1e-3)
+        bound = load_bound(study.robot, Markers(places, shape.p, 1e-3), study.force, study.location, study.base_wrench)
         found[f"location_std_{name}_m"] = float(bound[0])
     return found
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrod import Model, PaperCoordinates, Robot
+from torchrod import Markers, PaperCoordinates, Problem, Robot, Unknowns
 
 TABLE = Path(__file__).with_name("paper_search.csv")
 STRICT = 0.01  # of the criterion of paper_settings: the strict one
@@ -24,11 +24,11 @@ TUNING = {  # column of the search -> how it is written
 WIDTH, BEYOND, TIP_STD = 0.006, 0.004, (2e-3, 2e-3)  # m, m, (N, N m): the best of the search, with paper_settings
 
 
-def paper_model(robot: Robot, count: int = 1) -> Model:
+def paper_problem(robot: Robot, markers: Markers, count: int = 1) -> Problem:
     """Paper mode's coordinates and W of the tip; paper_settings has the rest."""
     length = robot.rod.length
     coordinates = PaperCoordinates(count, length, WIDTH, beta1=-BEYOND, beta2=length + BEYOND)
-    return Model(robot, coordinates, scaled=False, tip_std=TIP_STD)
+    return Problem(robot, Unknowns(coordinates, scaled=False), [markers], tip_std=TIP_STD)
 
 
 def worse(row: Mapping[str, Any], which: str = "") -> float:

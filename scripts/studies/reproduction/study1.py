@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from torchrod.estimator import PAPER_GAIN
 from tqdm import tqdm
 
 from torchrod import Estimate, Status, estimate, paper_settings
+from torchrod.estimation.solve import PAPER_GAIN
 
 from .cases import Study, study1
-from .paper_mode import STRICT, paper_lines, paper_model
+from .paper_mode import STRICT, paper_lines, paper_problem
 
 NOISE = 1e-3
 ROWS = {"clean": (0.0, 1e-4), "noise_1mm": (NOISE, NOISE)}  # noise added, noise told
@@ -39,17 +39,17 @@ def _rms(x: Tensor) -> float:
 
 def paper_fit(study: Study, noise: float, gain: float | None = None) -> tuple[Estimate, float]:
     """Paper mode with and without noise, by its own criterion or by another one; and the seconds that it took."""
-    model = paper_model(study.robot)
-    settings = paper_settings(model)
+    problem = paper_problem(study.robot, study.noisy(noise, 1, NOISE))
+    settings = paper_settings(problem)
     start = time.perf_counter()
-    fit = estimate(model, study.noisy(noise, 1), NOISE, settings if gain is None else replace(settings, gain=gain))
+    fit = estimate(problem, settings if gain is None else replace(settings, gain=gain))
     return fit, time.perf_counter() - start
 
 
 def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
     """Every row of the study, its table and its figure. The data hold the point-like prior's row, and all in `rows`."""
     study, whole = study1(20 if quick else 100), study1(100)
-    study.estimate(study.noisy(0.0, 1), 1e-4, "point")  # the first call pays for compiling and caches
+    study.estimate(study.noisy(0.0, 1, 1e-4), "point")  # the first call pays for compiling and caches
     rows: dict[str, dict[str, dict[str, float]]] = {noise: {} for noise in ROWS}
     noisy: dict[str, Estimate] = {}
     for name, (noise, sigma) in ROWS.items():
@@ -58,7 +58,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
             if prior == "paper mode":
                 fit, seconds = paper_fit(whole, noise)
             else:
-                fit = study.estimate(study.noisy(noise, 1), sigma, prior)
+                fit = study.estimate(study.noisy(noise, 1, sigma), prior)
                 seconds = time.perf_counter() - start
             rows[name][prior] = figures_of(fit, whole if prior == "paper mode" else study, seconds)
             if noise and prior != "paper mode":
@@ -94,7 +94,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
 
 def efficiency(study: Study, prior: str) -> dict[str, float]:
     """RMS of error over bound, and RMS error over RMS bound, with 1 mm noise."""
-    fit = study.estimate(study.noisy(NOISE, 2), NOISE, prior)
+    fit = study.estimate(study.noisy(NOISE, 2), prior)
     done = fit.status == Status.CONVERGED
     location = (fit.location[:, 0] - study.location)[done]
     force = (fit.magnitude[:, 0] - study.force.norm(dim=-1))[done]

@@ -15,12 +15,13 @@ from torchrod import (
     FourierCoordinates,
     GaussianCoordinates,
     Markers,
-    Model,
     PointCoordinates,
     PolynomialLoads,
+    Problem,
     Robot,
     Settings,
     Status,
+    Unknowns,
     estimate,
     solve_shape,
 )
@@ -53,9 +54,9 @@ class Study2:
         return Study2(self.robot, PolynomialLoads(self.load.coefficients[:count], L), self.positions[:count])
 
     def noisy(self, noise: float) -> Markers:
-        """Markers with Gaussian noise (m)."""
+        """Markers with Gaussian noise (m); without, they state CLEAN_SIGMA."""
         draw = torch.randn(self.positions.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        return Markers(S, self.positions + noise * draw)
+        return Markers(S, self.positions + noise * draw, noise or CLEAN_SIGMA)
 
 
 def study2(count: int, seed: int = 0) -> Study2:
@@ -91,11 +92,11 @@ def families(robot: Robot, regularized: bool) -> dict[str, GaussianCoordinates |
     }
 
 
-def figures_of(fit: Estimate, study: Study2, model: Model, seconds: float) -> dict[str, float | None]:
+def figures_of(fit: Estimate, study: Study2, problem: Problem, seconds: float) -> dict[str, float | None]:
     """Convergence, iterations, RMS distance of the fitted from the true shape, and RMS error of the load carried up to s (N)."""
     done = fit.status == Status.CONVERGED
     shape = (fit.centre_line - study.positions).square().sum(-1).mean(-1).sqrt()[done]
-    force = force_error(fit, study, model)[done]
+    force = force_error(fit, study, problem)[done]
     return {
         "converged": float(done.double().mean()),
         "accepted": float(fit.accepted.double().mean()),
@@ -110,10 +111,10 @@ def _mean(x: Tensor) -> float | None:
     return float(x.mean()) if len(x) else None
 
 
-def force_error(fit: Estimate, study: Study2, model: Model) -> Tensor:
+def force_error(fit: Estimate, study: Study2, problem: Problem) -> Tensor:
     """RMS over s of |G(s) - G_true(s)| (N), G the load carried up to s: what a density of points can be compared by."""
     s = torch.linspace(0, L, 101, dtype=torch.float64).reshape(1, 101, 1).expand(1, 101, 3)
-    (load,) = model.coordinates.loads(model.split(fit.x.nan_to_num(0.0))[0])
+    (load,) = problem.unknowns.loads.loads(problem.state.loads.of(fit.x.nan_to_num(0.0)))
     ours, true = load.integrals(s, s).G, study.load.integrals(s, s).G
     assert ours is not None and true is not None
     return (ours - true)[:, :, 0].square().sum(-1).mean(-1).sqrt()
@@ -140,19 +141,17 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
             for name, (share, shape) in PAPER.items()
         ),
     ]
-    example: dict[str, tuple[Estimate, Model]] = {}
+    example: dict[str, tuple[Estimate, Problem]] = {}
     plan = [(noise, regularized, name) for noise in (0.0, NOISE) for regularized in (True, False) for name in LABELS]
     for noise, regularized, name in tqdm(plan, desc="study2", delay=1.0, leave=False):
-        few = study
-        model = Model(few.robot, families(few.robot, regularized)[name])
+        problem = Problem(study.robot, Unknowns(families(study.robot, regularized)[name]), [study.noisy(noise)])
         start = time.perf_counter()
-        settings = POINT if name == "point" else Settings()
-        fit = estimate(model, few.noisy(noise), noise or CLEAN_SIGMA, settings)
-        row = figures_of(fit, few, model, time.perf_counter() - start)
+        fit = estimate(problem, POINT if name == "point" else Settings())
+        row = figures_of(fit, study, problem, time.perf_counter() - start)
         if regularized:
             data[name]["noise_1mm" if noise else "clean"] = row
             if noise:
-                example[name] = (fit, model)
+                example[name] = (fit, problem)
         else:
             data[name]["unregularized"]["noise_1mm" if noise else "clean"] = row
         lines.append(_line(noise, name, regularized, row))
@@ -207,7 +206,7 @@ def _ahead(a: dict[str, float | None], b: dict[str, float | None]) -> bool:
     return a["converged"] >= b["converged"] and mine is not None and other is not None and mine < other
 
 
-def _figure(study: Study2, example: dict[str, tuple[Estimate, Model]], path: Path) -> None:
+def _figure(study: Study2, example: dict[str, tuple[Estimate, Problem]], path: Path) -> None:
     """Case 0 with 1 mm noise: true and fitted load carried up to s, both components."""
     figure = Figure(figsize=(9, 4.3), layout="constrained")
     s = torch.linspace(0, L, 201, dtype=torch.float64).reshape(1, 201, 1).expand(1, 201, 3)
@@ -216,8 +215,8 @@ def _figure(study: Study2, example: dict[str, tuple[Estimate, Model]], path: Pat
         true = study.load.integrals(s, s).G
         assert true is not None
         axes.plot(1e3 * s[0, :, 0], true[0, :, 0, axis], color="#1b2a41", lw=2.5, label="true")
-        for name, (fit, model) in example.items():
-            (load,) = model.coordinates.loads(model.split(fit.x[:1].nan_to_num(0.0))[0])
+        for name, (fit, problem) in example.items():
+            (load,) = problem.unknowns.loads.loads(problem.state.loads.of(fit.x[:1].nan_to_num(0.0)))
             ours = load.integrals(s, s).G
             assert ours is not None
             axes.plot(1e3 * s[0, :, 0], ours[0, :, 0, axis], color=COLOURS[name], lw=1.2, label=LABELS[name])

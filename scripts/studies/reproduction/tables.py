@@ -16,7 +16,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrod import Estimate, Fit, Robot, Status, draw_on
+from torchrod import Estimate, FittedRod, Robot, Status, draw_on
 
 from .printed_rows import READINGS, TEXT, Case, mean_known, paper_means, printed, read_cases
 from .twins import DIAMETER, MARKERS, MISMATCH, NOISE, TENSION_STD, Twin, one_tendon, twin, two_tendons
@@ -217,10 +217,10 @@ def _figure6(fits: Fitted, path: Path) -> None:
         axes = figure.add_subplot(1, len(FIGURE6), k + 1, projection="3d")
         assert isinstance(axes, Axes3D)
         order, rank = fit.location[b].argsort(), case.location[b].argsort()
-        shown = fit.fit(b)
-        shown = Fit(shown.force[order], shown.location[order], shown.width[order], shown.base_wrench)
-        truth = Fit(case.force[b][rank], case.location[b][rank], torch.zeros(K, dtype=torch.float64), case.base_wrench[b])
-        draw_on(axes, case.robot, shown, case.told, b, truth, MEASURED)
+        shown = fit.fitted_rod(b)
+        shown = FittedRod(shown.force[order], shown.location[order], shown.width[order], shown.base_wrench)
+        truth = FittedRod(case.force[b][rank], case.location[b][rank], torch.zeros(K, dtype=torch.float64), case.base_wrench[b])
+        draw_on(axes, case.robot, shown, case.told.positions[b], case.read[b], truth, MEASURED)
         axes.set_title(f"Table III, case {pair}\n{axes.get_title()}", fontsize=11, y=0.95)
     assert axes is not None
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=7, frameon=False)

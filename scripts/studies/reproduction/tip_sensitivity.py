@@ -18,7 +18,7 @@ from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from torchrod import Markers, Model, PointCoordinates, PointForces, Robot, solve_shape
+from torchrod import Markers, PointCoordinates, PointForces, Problem, Robot, Unknowns, solve_shape
 
 from .sinusoids import printed_beam
 
@@ -39,11 +39,12 @@ def beam_by_tip(F: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
 def equilibrium_jacobian(robot: Robot, F: Tensor, a: Tensor, s: Tensor) -> Tensor:
     """J of (8) for forces F (B,) along the section's x at a (B,), measured at s (P,): (B, 3 P, 2) in m/N and m/m."""
     scale, length = robot.rod.force_scale, robot.rod.length
-    model = Model(robot, PointCoordinates(1, length, scale), scaled=False, steps=STEPS)
     load = PointForces(torch.nn.functional.pad(F[:, None, None], (0, 2)), a.unsqueeze(-1))
     shape = solve_shape(robot, (load,), None, s, len(F), STEPS)
     gamma = torch.stack([F / scale, 0 * F, torch.logit(a / length)], -1)
-    _, H = model.linearized(model.join(gamma, shape.base_wrench), Markers(s, shape.p))
+    # The noise plays no part in H.
+    problem = Problem(robot, Unknowns(PointCoordinates(1, length, scale), scaled=False), [Markers(s, shape.p, 1.0)], steps=STEPS)
+    _, H = problem.linearized(problem.state.join(gamma, shape.base_wrench))
     # From (F / scale, eta) to (F, a): da/deta = a (1 - a / L).
     chain = torch.stack([torch.full_like(F, 1 / scale), 1 / (a * (1 - a / length))], -1).unsqueeze(1)
     p, c = H[:, :-6], H[:, -6:]

@@ -20,13 +20,14 @@ from torchrod import (
     Estimate,
     GaussianCoordinates,
     Markers,
-    Model,
     PointForces,
+    Problem,
     Robot,
     Rod,
     Status,
     Tendon,
     Tendons,
+    Unknowns,
     estimate,
     solve_displacement,
 )
@@ -60,7 +61,8 @@ def two_tendons() -> Robot:
 @dataclass(frozen=True)
 class Twin:
     """What was done to a robot and seen of it: displacement (B, T) m, force (B, K, 2) N, location (B, K) m, true tension (B, T) N,
-    base wrench (B, 6), whether there is an equilibrium (B,), and what the estimator is told: noisy markers and tensions as read.
+    base wrench (B, 6), whether there is an equilibrium (B,), and what the estimator is told: noisy markers and `read` (B, T) N, the
+    tensions as read.
     """
 
     robot: Robot
@@ -70,14 +72,13 @@ class Twin:
     base_wrench: Tensor
     solved: Tensor
     told: Markers
+    read: Tensor
 
     def estimate(self) -> Estimate:
         """As many contacts as there are, gravity and tensions known, registration perfect; NaN markers where there is no shape."""
         rod = self.robot.rod
-        model = Model(
-            self.robot, GaussianCoordinates(self.location.shape[1], rod.length, rod.force_scale, "point"), tension_std=TENSION_STD
-        )
-        return estimate(model, self.told, NOISE)
+        loads = GaussianCoordinates(self.location.shape[1], rod.length, rod.force_scale, "point")
+        return estimate(Problem(self.robot, Unknowns(loads, tension_std=TENSION_STD), [self.told], self.read))
 
 
 def twin(robot: Robot, displacement: Tensor, force: Tensor, location: Tensor, mismatch: float, draws: int, seed: int) -> Twin:
@@ -98,6 +99,6 @@ def twin(robot: Robot, displacement: Tensor, force: Tensor, location: Tensor, mi
     tension = k * answer.tension
     p = answer.equilibrium.p
     noisy = p + NOISE * torch.randn(p.shape, generator=generator, dtype=torch.float64)
-    told = Markers(s, noisy, None, (tension * read).nan_to_num(0.0))
     solved = answer.equilibrium.status == int(Status.CONVERGED)
-    return Twin(robot, f, at, tension, k * answer.equilibrium.base_wrench, solved, told)
+    wrench, told = k * answer.equilibrium.base_wrench, Markers(s, noisy, NOISE)
+    return Twin(robot, f, at, tension, wrench, solved, told, (tension * read).nan_to_num(0.0))

@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from studies.reproduction.cases import L, steel_rod
-from torchrod import GaussianCoordinates, Markers, Model, PointForces, solve_shape
+from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Registration, Unknowns, solve_shape
 
 T = TypeVar("T")
 NOISE, SHIFT, TURN = 1e-3, 5e-3, math.radians(3)
@@ -33,9 +33,14 @@ def generator(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def model(count: int, prior: str = "contact", registration: bool = False, frame_std: tuple[float, float] | None = None) -> Model:
-    """The default model of so many pushes."""
-    return Model(ROBOT, GaussianCoordinates(count, L, ROBOT.rod.force_scale, prior), registration, frame_std=frame_std)
+def pushed(count: int, prior: str = "contact", registration: Registration | None = None) -> Unknowns:
+    """The default unknowns of so many pushes."""
+    return Unknowns(GaussianCoordinates(count, L, ROBOT.rod.force_scale, prior), registration=registration)
+
+
+def posed(markers: Markers, unknowns: Unknowns) -> Problem:
+    """Of markers on the rod."""
+    return Problem(ROBOT, unknowns, [markers])
 
 
 def pushes(count: int, samples: int, g: torch.Generator, size: tuple[float, float] = (0.5, 1.0)) -> tuple[Tensor, Tensor]:
@@ -49,7 +54,7 @@ def pushes(count: int, samples: int, g: torch.Generator, size: tuple[float, floa
 
 def noisy(s: Tensor, positions: Tensor, g: torch.Generator) -> Markers:
     """1 mm on every coordinate."""
-    return Markers(s, positions + NOISE * torch.randn(positions.shape, generator=g, dtype=torch.float64))
+    return Markers(s, positions + NOISE * torch.randn(positions.shape, generator=g, dtype=torch.float64), NOISE)
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,9 @@ class Touched:
     positions: Tensor
     base_wrench: Tensor
 
-    def markers(self, noise: Tensor) -> Markers:
-        """With this noise (B, P, 3) m."""
-        return Markers(self.s, self.positions + noise)
+    def markers(self, errors: Tensor, noise: float) -> Markers:
+        """With these errors (B, P, 3) m, of which they state this noise (m)."""
+        return Markers(self.s, self.positions + errors, noise)
 
 
 def touched(count: int, samples: int, g: torch.Generator, markers: int = 20, size: tuple[float, float] = (0.5, 1.0)) -> Touched:

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from torch import Tensor
 
 from studies.reproduction.cases import L, S
-from torchrod import Estimate, Model, Status, estimate, forward_jacobian, load_profile, solve_shape
+from torchrod import Estimate, Problem, Status, estimate, forward_jacobian, load_profile, solve_shape
 
-from .cases import NOISE, ROBOT, generator, in_parallel, model, noisy, pushes
+from .cases import ROBOT, generator, in_parallel, noisy, posed, pushed, pushes
 
 Z95 = 1.959964
 SHOWN = 0.05  # of the largest |f| that the band allows: places where it allows less count as unloaded
@@ -35,37 +35,38 @@ ROWS = (
 )
 
 
-def _drawn(row: Row, samples: int, seed: int) -> tuple[Model, Tensor, Estimate]:
+def _drawn(row: Row, samples: int, seed: int) -> tuple[Problem, Tensor, Estimate]:
     """Loads with widths from the prior, gamma (B, n), and their estimate."""
-    g, of = generator(seed), model(row.contacts, row.prior)
+    g, unknowns = generator(seed), pushed(row.contacts, row.prior)
     force, place = pushes(row.contacts, samples, g, row.size)
-    mean = of.coordinates.prior()[0].unflatten(0, (row.contacts, 4))[:, 3]
+    mean = unknowns.loads.prior()[0].unflatten(0, (row.contacts, 4))[:, 3]
     width = mean + torch.randn(samples, row.contacts, generator=g, dtype=torch.float64)
     gamma = torch.cat([force / ROBOT.rod.force_scale, torch.stack([torch.logit(place / L), width], -1)], -1).flatten(1)
-    shape = solve_shape(ROBOT, of.coordinates.loads(gamma), None, S, samples, 80)
-    return of, gamma, estimate(of, noisy(S, shape.p, g), NOISE)
+    shape = solve_shape(ROBOT, unknowns.loads.loads(gamma), None, S, samples, 80)
+    problem = posed(noisy(S, shape.p, g), unknowns)
+    return problem, gamma, estimate(problem)
 
 
-def _three(of: Model, gamma: Tensor, s: Tensor) -> Tensor:
+def _three(problem: Problem, gamma: Tensor, s: Tensor) -> Tensor:
     """f_x, f_y, |f| (B, S, 3)."""
-    f = of.coordinates.loads(gamma)[0].density(s)
+    f = problem.unknowns.loads.loads(gamma)[0].density(s)
     assert f is not None
     return torch.cat([f[..., :2], f.norm(dim=-1, keepdim=True)], -1)
 
 
 def measured(row: Row, samples: int, seed: int) -> tuple[list[float], list[float], list[float]]:
     """Shares that hold the truth: NAMES; f_x, f_y, |f| of the first-order band; and |f| by distance from the estimate in widths."""
-    of, gamma, fit = _drawn(row, samples, seed)
+    problem, gamma, fit = _drawn(row, samples, seed)
     done = fit.status == int(Status.CONVERGED)
-    g = of.coordinates.size
-    x, C, true = fit.x[done], fit.covariance[done], of.coordinates.describe(gamma[done])
-    profile = load_profile(of, x, C)
+    g = problem.state.loads.size
+    x, C, true = fit.x[done], fit.covariance[done], problem.unknowns.loads.describe(gamma[done])
+    profile = load_profile(problem, x, C)
     assert profile is not None
-    f, estimated = _three(of, gamma[done], profile.s), _three(of, x[:, :g], profile.s)
+    f, estimated = _three(problem, gamma[done], profile.s), _three(problem, x[:, :g], profile.s)
     high = profile.band[..., 2, 1]
     seen = high > SHOWN * high.amax(-1, keepdim=True)
     held = (profile.band[..., 0] <= f) & (f <= profile.band[..., 1])
-    _, J = forward_jacobian(lambda gamma: _three(of, gamma, profile.s).flatten(1), x[:, :g])
+    _, J = forward_jacobian(lambda gamma: _three(problem, gamma, profile.s).flatten(1), x[:, :g])
     std = ((J @ C[:, :g, :g]) * J).sum(-1).clamp(min=0).sqrt().reshape(f.shape)
     linear = (f - estimated).abs() <= Z95 * std
     order = fit.location[done].argsort(-1)

@@ -9,13 +9,13 @@ import torch
 from matplotlib.axes import Axes
 from torch import Tensor
 
-from torchrod import Estimate, Markers, common_frame, estimate, load_bound
+from torchrod import Estimate, Markers, Registration, Scope, estimate, load_bound
 
-from .cases import NOISE, ROBOT, SHIFT, TURN, Touched, generator, in_parallel, model, moved, noisy, touched
+from .cases import NOISE, ROBOT, SHIFT, TURN, Touched, generator, in_parallel, moved, noisy, posed, pushed, touched
 
 TOGETHER = (5, 10, 100)
 HALF_NORMAL = math.sqrt(2 / math.pi)
-KNOWN_SIZE = (SHIFT / math.sqrt(3), TURN / math.sqrt(3))  # of a component, where the size of the whole is known
+KNOWN_SIZE = Registration(SHIFT / math.sqrt(3), TURN / math.sqrt(3))  # of a component, where the size of the whole is known
 PLATES = {  # markers on the rod, on the base plate, and how far from the axis (m)
     "4 of the 20 markers on the base plate (100 mm off the axis)": (16, 4, 0.1),
     "4 markers more, there (200 mm)": (20, 4, 0.2),
@@ -38,26 +38,21 @@ def _with_plate(samples: int, on_rod: int, on_plate: int, radius: float) -> tupl
     positions = torch.cat([plate.expand(samples, -1, 3), rod.positions], 1)
     true = Touched(rod.force, rod.place, torch.cat([0 * angle, rod.s]), positions, rod.base_wrench)
     offsets = torch.cat([plate, plate.new_zeros(on_rod, 3)])
-    return true, Markers(true.s, noisy(true.s, positions, g).positions, offsets)
+    return true, Markers(true.s, noisy(true.s, positions, g).positions, NOISE, offsets)
 
 
 def _off(true: Touched, clean: Markers, shared: int, seed: int) -> Markers:
     """The same noise on markers whose base frame is off, the same one for so many shapes."""
     seen = moved(true.positions, generator(seed), shared) + clean.positions - true.positions
-    return Markers(true.s, seen, clean.offsets)
+    return Markers(true.s, seen, NOISE, clean.offsets)
 
 
 def _one_frame(shared: int, samples: int, seed: int) -> Estimate:
     """--registration --one-frame on groups of `shared` shapes."""
     true, clean = _cases(samples)
     markers = _off(true, clean, shared, seed)
-    fits, apart, known = [], model(1, registration=True), model(1)
-    for index in torch.arange(len(markers.positions)).split(shared):
-        part, everyone = markers.take(index), torch.arange(len(index))
-        frame = common_frame([(apart, everyone)], part, NOISE, estimate(apart, part, NOISE))
-        part = frame.corrected(part)
-        fits.append(frame.widened([(known, everyone)], part, NOISE, estimate(known, part, NOISE)))
-    return Estimate.cat(fits)
+    problem = posed(markers, pushed(1, registration=Registration(scope=Scope.SHARED)))
+    return Estimate.cat([estimate(problem.take(index)) for index in torch.arange(problem.batch).split(shared)])
 
 
 def _errors(fit: Estimate, true: Touched) -> list[float]:
@@ -69,9 +64,9 @@ def _errors(fit: Estimate, true: Touched) -> list[float]:
     return [float(v) for v in found]
 
 
-def _bound(true: Touched, clean: Markers, registration: bool, frame_std: tuple[float, float] | None = None) -> list[float]:
+def _bound(true: Touched, clean: Markers, registration: Registration | None) -> list[float]:
     """Mean |error| of an unbiased Gaussian estimator at the Cramer-Rao bound."""
-    both = load_bound(ROBOT, clean, true.force[:, 0], true.place[:, 0], true.base_wrench, NOISE, registration, frame_std=frame_std)
+    both = load_bound(ROBOT, clean, true.force[:, 0], true.place[:, 0], true.base_wrench, registration=registration)
     return [HALF_NORMAL * float(v.mean()) for v in both]
 
 
@@ -79,23 +74,23 @@ def run(samples: int, axes: Axes) -> list[str]:
     """The table, and the ratio of the errors to those with a perfect frame."""
     true, clean = _cases(samples)
     off = _off(true, clean, 1, 299)
-    known, apart, sized = model(1), model(1, registration=True), model(1, registration=True, frame_std=KNOWN_SIZE)
+    known, apart, sized = pushed(1), pushed(1, registration=Registration()), pushed(1, registration=KNOWN_SIZE)
     rows = {
-        "perfect frame": estimate(known, clean, NOISE),
-        "perfect frame, --registration": estimate(apart, clean, NOISE),
-        "frame off": estimate(known, off, NOISE),
-        "frame off, --registration": estimate(apart, off, NOISE),
-        "frame off, --registration, --frame-std 2.9e-3 0.03": estimate(sized, off, NOISE),
+        "perfect frame": estimate(posed(clean, known)),
+        "perfect frame, --registration": estimate(posed(clean, apart)),
+        "frame off": estimate(posed(off, known)),
+        "frame off, --registration": estimate(posed(off, apart)),
+        "frame off, --registration, --frame-std 2.9e-3 0.03": estimate(posed(off, sized)),
     }
     bounds = {
-        "bound, frame known": _bound(true, clean, False),
-        "bound, frame unknown": _bound(true, clean, True),
-        "bound, the size of its error known": _bound(true, clean, True, KNOWN_SIZE),
+        "bound, frame known": _bound(true, clean, None),
+        "bound, frame unknown": _bound(true, clean, Registration()),
+        "bound, the size of its error known": _bound(true, clean, KNOWN_SIZE),
     }
     for name, layout in PLATES.items():
         also, seen = _with_plate(samples, *layout)
-        rows[f"frame off, --registration, {name}"] = estimate(apart, _off(also, seen, 1, 299), NOISE)
-        bounds[f"bound, frame unknown, {name}"] = _bound(also, seen, True)
+        rows[f"frame off, --registration, {name}"] = estimate(posed(_off(also, seen, 1, 299), apart))
+        bounds[f"bound, frame unknown, {name}"] = _bound(also, seen, Registration())
     groups = [n for n in TOGETHER if n <= samples]
     for shared, fit in zip(groups, in_parallel(_one_frame, groups, samples, 300, "frame"), strict=True):
         rows[f"frame off, --one-frame, {shared} shapes"] = fit

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchrod import Estimate, Markers, Settings, estimate, load_bound
 
-from .cases import NOISE, ROBOT, Touched, generator, in_parallel, model, noisy, touched
+from .cases import ROBOT, Touched, generator, in_parallel, noisy, posed, pushed, touched
 
 AWAY = 0.05  # m: how far a marker that is off is off, in a random direction
 ROBUST = 10.0  # degrees of freedom of --robust
@@ -91,9 +91,9 @@ def _cases(row: Row, samples: int, seed: int) -> tuple[torch.Generator, Touched,
 def missing(row: Row, samples: int, seed: int) -> list[list[float]]:
     """Location, force: error ratio (mean; RMS) with its interval and the bounds' ratio; at last shares that hold, accepted."""
     g, true, clean, _, markers = _cases(row, samples, seed)
-    before, fit = (estimate(model(1), m, NOISE) for m in (clean, markers))
+    before, fit = (estimate(posed(m, pushed(1))) for m in (clean, markers))
     push = true.force[:, 0], true.place[:, 0], true.base_wrench
-    bounds = [load_bound(ROBOT, m, *push, NOISE) for m in (clean, markers)]
+    bounds = [load_bound(ROBOT, m, *push) for m in (clean, markers)]
     found = []
     for e, e0, b0, b in zip(_errors(fit, true), _errors(before, true), *bounds, strict=True):
         found += [[*ratio(size, e, e0, g), float(size(b) / size(b0))] for size in (_mean, _rms)]
@@ -109,13 +109,12 @@ def off(row: Row, samples: int, seed: int) -> list[list[float]]:
     named, accepted, and the location's mean ratio without --robust.
     """
     g, true, clean, bad, markers = _cases(row, samples, seed)
-    of = model(row.contacts)
-    before, plain = (estimate(of, m, NOISE) for m in (clean, markers))
-    fit = estimate(of, markers, NOISE, Settings(robust=ROBUST))
-    first, second, third = (_errors(f, true) for f in (before, fit, plain))
-    found = [ratio(size, e, e0, g) for e, e0 in zip(second, first, strict=True) for size in (_mean, _rms)]
+    first, problem = (posed(m, pushed(row.contacts)) for m in (clean, markers))
+    before, plain, fit = estimate(first), estimate(problem), estimate(problem, Settings(robust=ROBUST))
+    at_best, robust, astray = (_errors(f, true) for f in (before, fit, plain))
+    found = [ratio(size, e, e0, g) for e, e0 in zip(robust, at_best, strict=True) for size in (_mean, _rms)]
     named = [float((fit.outlier & where).sum() / where.sum().clamp(min=1)) for where in (bad, ~bad)]
-    without = float(_mean(third[0].flatten()) / _mean(first[0].flatten()))
+    without = float(_mean(astray[0].flatten()) / _mean(at_best[0].flatten()))
     return [*found, [*named, float(fit.accepted.double().mean()), without]]
 
 

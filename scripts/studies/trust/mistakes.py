@@ -1,14 +1,14 @@
 """Exchanged labels, outliers, base frames that are off: how often they are told, and how often of shapes without them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
-from torchrod import Settings, cold_start, diagnose, estimate
-from torchrod.analysis.count import Hypothesis, select
+from torchrod import Hypothesis, diagnose, estimate, select
+from torchrod.analysis.count import parts_of
 
-from .cases import NOISE, exchanged, generator, in_parallel, model, moved, noisy, touched
+from .cases import NOISE, exchanged, generator, in_parallel, moved, noisy, posed, pushed, touched
 from .markers import Row as Spoiled
 from .markers import chosen, spoiled
 
@@ -48,18 +48,6 @@ ROWS = (
 )
 
 
-class Quiet:
-    """No progress bar inside a row."""
-
-    def __enter__(self) -> "Quiet":
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def update(self, _: int) -> None:
-        """Nothing."""
-
-
 def measured(row: Row, samples: int, seed: int) -> Sequence[object]:
     """accepted; right and wrong exchanges; exactly the outliers told, others told; base frame; one more contact; unit or frame."""
     g = generator(seed)
@@ -68,18 +56,18 @@ def measured(row: Row, samples: int, seed: int) -> Sequence[object]:
     markers, pairs = noisy(true.s, p, g), [()] * samples
     if row.pairs:
         p, pairs = exchanged(markers.positions, row.pairs, g)
-        markers = type(markers)(true.s, p)
+        markers = replace(markers, positions=p)
     kind = Spoiled("", row.astray, row.markers, off=True)
     bad = chosen(kind, samples, g)
-    markers = spoiled(kind, markers, bad, g) if row.astray else markers
+    markers = replace(spoiled(kind, markers, bad, g) if row.astray else markers, noise=row.stated)
+    problem, parts = posed(markers, pushed(row.fitted or 1)), None
     if row.fitted:
-        one = model(row.fitted)
-        fit, parts = estimate(one, markers, row.stated), [(one, torch.arange(samples))]
+        fit = estimate(problem)
     else:
-        counts = [Hypothesis(str(k), k, model(k)) for k in range(4)]
-        fit, evidence = select(counts, markers, row.stated, Settings(), lambda _: cold_start, lambda *_: Quiet())
-        parts = [(h.model, (evidence.choice == i).nonzero().squeeze(-1)) for i, h in enumerate(counts)]
-    told = diagnose(parts, markers, row.stated, fit)
+        counts = [Hypothesis(str(k), k, pushed(k)) for k in range(4)]
+        fit, evidence = select(problem, counts)
+        parts = parts_of(counts, evidence)
+    told = diagnose(problem, fit, parts=parts)
     right = sum(bool(b) and a == b for a, b in zip(told.exchanged, pairs, strict=True))
     wrong = sum(bool(a) and a != b for a, b in zip(told.exchanged, pairs, strict=True))
     astray = [tuple(row.nonzero().flatten().tolist()) for row in bad]

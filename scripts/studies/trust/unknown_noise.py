@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import torch
 
-from torchrod import Settings, cold_start, estimate_noise_among
-from torchrod.analysis.count import Hypothesis, select
+from torchrod import Hypothesis, estimate_noise_among, select
+from torchrod.analysis.noise import with_noise
 
-from .cases import generator, in_parallel, model, touched
-from .mistakes import Quiet
+from .cases import generator, in_parallel, posed, pushed, touched
 
 SIZE = 0.5, 2.0  # N
 FAR = 1.5  # times too large or too small
@@ -31,12 +30,12 @@ def measured(row: Row, samples: int, seed: int) -> list[float]:
     g = generator(seed)
     true = touched(row.contacts, samples, g, row.markers, SIZE)
     draw = torch.randn(true.positions.shape, generator=g, dtype=torch.float64)
-    counts = [Hypothesis(str(k), k, model(k)) for k in range(4)]
-    markers = true.markers(row.noise * draw)
-    found, known = estimate_noise_among([h.model for h in counts], markers)
+    counts = [Hypothesis(str(k), k, pushed(k)) for k in range(4)]
+    problem = posed(true.markers(row.noise * draw, row.noise), pushed(1))
+    found, sigma = estimate_noise_among(problem, [h.unknowns for h in counts])
     right = []
-    for some, noise in ((markers, row.noise), (known, row.noise)):
-        fit, evidence = select(counts, some, noise, Settings(), lambda _: cold_start, lambda *_: Quiet())
+    for told in (problem, with_noise(problem, sigma)):
+        fit, evidence = select(told, counts)
         right.append(float((evidence.choice == row.contacts).double().mean()))
     off = found.sigma / row.noise
     far = ((off > FAR) | (off < 1 / FAR)).double().mean()
