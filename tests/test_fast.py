@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.problems import posed
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import (
     FourierCoordinates,
     GaussianCoordinates,
-    Markers,
-    Model,
     PointForces,
     PointWrenches,
+    Registration,
     Robot,
     Rod,
     forward_jacobian,
@@ -46,24 +46,24 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 
 @needs_compiler
-@pytest.mark.parametrize("registration", [False, True], ids=["", "registration"])
+@pytest.mark.parametrize("registration", [None, Registration()], ids=["", "registration"])
 @pytest.mark.parametrize("loads", ["one gaussian", "three gaussians", "fourier"])
 @pytest.mark.parametrize("kind", ["passive", "tendons and gravity", "full stiffness"])
 def test_values_and_jacobians(kind, loads, registration):
-    """model.linearized, which marches in the kernel, against forward_jacobian of the torch model."""
+    """Problem.linearized, which marches in the kernel, against forward_jacobian of the torch model."""
     robot = {"passive": steel_rod, "tendons and gravity": busy_robot, "full stiffness": stiffened}[kind]()
     scale = robot.rod.force_scale
-    coordinates = {
+    family = {
         "one gaussian": GaussianCoordinates(1, 0.4, scale),
         "three gaussians": GaussianCoordinates(3, 0.4, scale),
         "fourier": FourierCoordinates(3, 0.4, scale),
     }[loads]
-    model = Model(robot, coordinates, registration, steps=10)
-    markers = Markers(T([0.1, 0.25, 0.4]), torch.zeros(3, 3, 3), 0.01 * torch.eye(3), TENSION if len(robot.tendons) else None)
-    generator = torch.Generator().manual_seed(1)
-    x = model.join(coordinates.start().expand(3, -1), torch.zeros(3, 6)) + 0.3 * torch.randn(3, model.size, generator=generator)
-    h, H = model.linearized(x, markers)
-    reference_h, reference_H = forward_jacobian(lambda x: model.h(x, markers), x)
+    s, tension, offsets = T([0.1, 0.25, 0.4]), TENSION if len(robot.tendons) else None, 0.01 * torch.eye(3)
+    problem = posed(s, torch.zeros(3, 3, 3), 1e-3, robot, family, tension, offsets, steps=10, registration=registration)
+    start = problem.state.join(family.start().expand(3, -1), torch.zeros(3, 6))
+    x = start + 0.3 * torch.randn(3, problem.size, generator=torch.Generator().manual_seed(1))
+    h, H = problem.linearized(x)
+    reference_h, reference_H = forward_jacobian(problem.h, x)
     assert close(h, reference_h)
     assert close(H, reference_H)
 
@@ -103,15 +103,14 @@ def test_a_shape_without_tangents(robot):
 
 @needs_compiler
 def test_threads_do_not_change_the_answer():
-    model = Model(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
-    x = torch.randn(70, model.size, generator=torch.Generator().manual_seed(0)) * 0.3
-    markers = Markers(T([0.1, 0.4]), torch.zeros(70, 2, 3))
+    problem = posed(T([0.1, 0.4]), torch.zeros(70, 2, 3), loads=GaussianCoordinates(1, 0.4, 1.0))
+    x = torch.randn(70, problem.size, generator=torch.Generator().manual_seed(0)) * 0.3
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        one = model.linearized(x, markers)
+        one = problem.linearized(x)
         torch.set_num_threads(3)
-        three = model.linearized(x, markers)
+        three = problem.linearized(x)
     finally:
         torch.set_num_threads(before)
     assert torch.equal(one[0], three[0])
@@ -164,12 +163,12 @@ def test_the_torch_path_marches_with_its_tangents(monkeypatch):
     """Without the kernel, against torch.func through the whole of h, tip to base as well."""
     monkeypatch.setattr(kernel, "available", lambda: False)
     robot = busy_robot()
-    model = Model(robot, GaussianCoordinates(1, 0.4, robot.rod.force_scale), steps=4)
-    markers = Markers(T([0.1, 0.4]), torch.zeros(3, 2, 3), 0.01 * torch.eye(2, 3), TENSION)
-    x = 0.3 * torch.randn(3, model.size, generator=torch.Generator().manual_seed(1))
-    h, H = model.linearized(x, markers)
-    reference_h, reference_H = forward_jacobian(lambda x: model.h(x, markers), x)
+    s, offsets = T([0.1, 0.4]), 0.01 * torch.eye(2, 3)
+    problem = posed(s, torch.zeros(3, 2, 3), 1e-3, robot, tension=TENSION, offsets=offsets, steps=4)
+    x = 0.3 * torch.randn(3, problem.size, generator=torch.Generator().manual_seed(1))
+    h, H = problem.linearized(x)
+    reference_h, reference_H = forward_jacobian(problem.h, x)
     assert close(h, reference_h)
     assert close(H, reference_H)
     points = PointForces(T([[[0.3, 0.1, 0.0]], [[0.2, 0.4, 0.0]], [[0.0, 0.1, 0.0]]]), T([[0.11], [0.29], [0.4]]))
-    assert (solve_shape(robot, (points,), TENSION, markers.s, 3, 4).status == 0).all()
+    assert (solve_shape(robot, (points,), TENSION, s, 3, 4).status == 0).all()
