@@ -10,8 +10,9 @@ from scipy.integrate import simpson, solve_bvp, solve_ivp
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
+from tests.problems import posed
 from tests.robots import T, steel_rod
-from torchrod import Markers, Model, PointCoordinates, PointForces, PointWrenches, Robot, Rod, Status, Tendon, Tendons, solve_shape
+from torchrod import PointCoordinates, PointForces, PointWrenches, Robot, Rod, Status, Tendon, Tendons, solve_shape
 from torchrod.estimation.at_rest import without_load
 from torchrod.mechanics.statics import stable_at
 
@@ -206,6 +207,6 @@ def test_a_modulus_in_the_wrong_unit_is_told_at_once():
         robot = Robot(Rod.circular(0.4, 1.4e-3, E, 0.4 * E, 0.1), Tendons(), T([9.81, 0.0, 0.0]))
         began = time.monotonic()
         assert solve_shape(robot, (), None, LENGTH, 1).status[0] != Status.CONVERGED
-        model = Model(robot, PointCoordinates(1, 0.4, 1.0))
-        assert without_load(model, Markers(LENGTH, torch.zeros(2, 1, 3))).p.isnan().all()
+        problem = posed(LENGTH, torch.zeros(2, 1, 3), robot=robot, loads=PointCoordinates(1, 0.4, 1.0))
+        assert without_load(problem).p.isnan().all()
         assert time.monotonic() - began < 20
