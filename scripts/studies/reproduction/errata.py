@@ -38,7 +38,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
         "over_the_tip": shown.over_the_tip(),
         "sensitivity": tip_figures()["at_1_mN"],
         "units": unit_check(jacobian(steel_rod(), torch.ones(1).double(), torch.full((1,), 0.2).double())[0]),
-        "means": {table: paper_means(table) for table in ABOUT},
+        "means": {table: list(paper_means(table)) for table in ABOUT},
         "points": shown.points(),
     }
     sections = (_innovation, _index, _deflection, _damping, _actuation, _tables, _sums, _beyond, _joint, _points)
