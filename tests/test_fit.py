@@ -1,23 +1,25 @@
 """The compiled fit against the torch model, which is the definition: h, H, normal equations, the filter's iteration, whole fits.
 
-Whoever changes the torch step, a load family, the measurement or the filter without torchrod/fast fails here.
+Whoever changes the torch step, a load family, the problem or the filter without torchrod/kernel fails here.
 """
 
 import math
+from typing import Any
 
 import pytest
 import torch
 
+from tests.problems import posed
 from tests.robots import T, busy_robot, steel_rod
 from tests.test_fast import TENSION, needs_compiler, stiffened
 from torchrod import (
     FourierCoordinates,
     GaussianCoordinates,
-    Markers,
-    Model,
     PaperCoordinates,
     PointCoordinates,
     PointForces,
+    Problem,
+    Registration,
     Robot,
     Settings,
     cold_start,
@@ -27,10 +29,10 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.estimation import filter as ekf
-from torchrod.estimation.evaluator import Prepared
+from torchrod.estimation.evaluator import KernelEvaluator, Run, TorchEvaluator, evaluator, kernel_serves, normal
 from torchrod.mechanics.lie import move
 from torchrod.mechanics.tendons import Tendon, Tendons
-from torchrod.model.measurement import TIP_EXACT
+from torchrod.model.problem import TIP_EXACT
 
 pytestmark = needs_compiler
 B = 5
@@ -59,24 +61,25 @@ def close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-10) -> bool:
     return bool((a - b).abs().max() <= relative * b.abs().max())
 
 
-def case(robot: Robot, coordinates, registration: bool, tip: str, tension_std=None) -> tuple[Model, Markers, torch.Tensor]:
-    """A model somewhere, with markers on stalks one of which is missing."""
-    model = Model(robot, coordinates, registration, steps=10, tip=tip, tension_std=tension_std)
+def case(robot: Robot, family, noise: float = 1e-3, **unknown: Any) -> tuple[Problem, torch.Tensor]:
+    """A problem and a state somewhere, with markers on stalks one of which is missing."""
     generator = torch.Generator().manual_seed(1)
     positions = 0.1 * torch.randn(B, 3, 3, generator=generator)
     positions[1, 1] = torch.nan
     tension = TENSION[torch.tensor([0, 1, 2, 0, 1]), : len(robot.tendons)] if len(robot.tendons) else None
-    x = model.join(coordinates.start().expand(B, -1), torch.zeros(B, 6))
+    s, offsets = T([0.1, 0.25, 0.4]), 0.01 * torch.eye(3)
+    problem = posed(s, positions, noise, robot, family, tension, offsets, steps=10, **unknown)
+    x = problem.state.join(family.start().expand(B, -1), torch.zeros(B, 6))
     size = torch.where(x.abs() > 100, 0.1 * x.abs(), 1.0)
-    x = x + 0.3 * size * torch.randn(B, model.size, generator=generator)
-    return model, Markers(T([0.1, 0.25, 0.4]), positions, 0.01 * torch.eye(3), tension), x
+    x = x + 0.3 * size * torch.randn(B, problem.size, generator=generator)
+    return problem, x
 
 
 FRAMES = {
-    "plain": (False, "none"),
-    "zeta, tip wrench, tensions": (True, "wrench", 0.5),
-    "zeta, tip force": (True, "force"),
-    "tensions": (False, "none", 2.0),
+    "plain": {},
+    "zeta, tip wrench, tensions": {"registration": Registration(), "tip": "wrench", "tension_std": 0.5},
+    "zeta, tip force": {"registration": Registration(), "tip": "force"},
+    "tensions": {"tension_std": 2.0},
 }
 
 
@@ -85,40 +88,51 @@ FRAMES = {
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_h_jacobian_and_normal_equations(robot, family, frame):
     r = ROBOTS[robot]()
-    model, markers, x = case(r, FAMILIES[family](r.rod.force_scale), *FRAMES[frame])
-    prepared = Prepared(model, markers, model.weights(markers, 1e-3), nu=4.0)
+    problem, x = case(r, FAMILIES[family](r.rod.force_scale), **FRAMES[frame])
     if family == "points" and robot in ("helical tendons and gravity", "full stiffness"):
-        assert not prepared.compiled  # nodes that move under a curvature or a routing that varies: left to torch
+        assert not kernel_serves(problem)  # nodes that move under a curvature or a routing that varies: left to torch
         return
-    assert prepared.compiled
-    h, H = forward_jacobian(lambda x: model.h(x, markers), x)
-    tables = prepared.tables(x)
+    evaluate = evaluator(problem, nu=4.0)
+    assert isinstance(evaluate, KernelEvaluator)
+    h, H = forward_jacobian(problem.h, x)
+    tables = evaluate.tables(x)
     found = kernel.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
     assert close(found[0], h)
     assert close(found[1], H)
-    assert close(prepared.h(x), h)
-    assert close(found[2], model.shape(x, markers).p)
-    expected, sums = ekf.normal_equations(H, prepared.residual(h), prepared.w, 4.0), prepared.sums(x)
+    assert close(kernel.measure_now(x, torch.arange(B), False, tables.structure, tables.markers)[0], h)
+    assert close(found[2], problem.shape(x).p)
+    r = TorchEvaluator(problem).residual(h)
+    expected, sums = ekf.normal_equations(H, r, problem.weights, problem.groups, 4.0), evaluate.sums(x)
     for name in ("A", "g", "cost"):
         assert close(getattr(sums, name), getattr(expected, name)), name
-    assert close(sums.r, prepared.residual(h))
-    mean, precision = model.prior()
-    assert close(prepared.cost(x), expected.cost.sum(-1) + (precision * (mean - x) ** 2).sum(-1))
+    assert close(sums.r, r)
+    assert close(evaluate.cost(x), expected.cost.sum(-1) + (problem.precision * (problem.mean - x) ** 2).sum(-1))
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_both_evaluators_are_one(frame):
+    problem, x = case(hanging(), GaussianCoordinates(1, 0.4, 1.0), **FRAMES[frame])
+    kernels, definition = KernelEvaluator(problem, 4.0), TorchEvaluator(problem, 4.0)
+    one, other = kernels.sums(x), definition.sums(x)
+    for name in vars(other):
+        assert close(getattr(one, name), getattr(other, name)), name
+    assert close(kernels.cost(x), definition.cost(x))
+    assert close(kernels.posterior(one, x)[1], definition.posterior(other, x)[1])
 
 
 def test_the_covariance():
-    """Prepared.posterior against ekf.posterior, also where the normal equations have no inverse or are not finite."""
-    model, markers, x = case(steel_rod(), GaussianCoordinates(2, 0.4, 1.0), True, "force")
-    prepared = Prepared(model, markers, model.weights(markers, 1e-3))
-    sums = prepared.sums(x)
+    """KernelEvaluator.posterior against ekf.posterior, also where the normal equations have no inverse or are not finite."""
+    problem, x = case(steel_rod(), GaussianCoordinates(2, 0.4, 1.0), registration=Registration(), tip="force")
+    evaluate = KernelEvaluator(problem)
+    sums = evaluate.sums(x)
     sums.A[1] *= -1.0
     sums.A[2, 0, 3, 3] = torch.inf
     sums.A[3, 1, 5, 2] = sums.A[3, 1, 2, 5] = torch.nan
-    normal, prior = prepared.normal(sums), model.prior()
-    A = normal.exact(TIP_EXACT).whole(x, *prior)[0]
+    equations, prior = normal(problem, sums), (problem.mean, problem.precision)
+    A = equations.exact(TIP_EXACT).whole(x, *prior)[0]
     exact = ekf.posterior(A)
-    covariance, cost = prepared.posterior(sums, x)
-    assert torch.allclose(cost, normal.whole(x, *prior)[2], rtol=1e-12)
+    covariance, cost = evaluate.posterior(sums, x)
+    assert torch.allclose(cost, equations.whole(x, *prior)[2], rtol=1e-12)
     sound = torch.tensor([True, False, False, False, True])
     assert torch.isnan(exact[~sound]).all()
     assert torch.isnan(covariance[~sound]).all()
@@ -131,21 +145,22 @@ def test_the_covariance():
 
 def test_one_iteration_of_the_filter():
     """kernel.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
-    prepared = Prepared(model, markers, model.weights(markers, 0.1))
-    fitted = estimate(model, markers, 0.1).x
+    problem, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), noise=0.1)
+    evaluate = KernelEvaluator(problem)
+    fitted = estimate(problem).x
     x[0], x[3, 0] = fitted[0], torch.nan
-    sums = kernel.Sums.room(B, model.size, 3)
+    sums = kernel.Sums.room(B, problem.size, 15, 3)
     sums.A.fill_(torch.nan)
-    Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
+    Sigma0, Q = 0.5 * torch.eye(problem.size).repeat(B, 1, 1), 0.1 * torch.ones(problem.size)
     start = ekf.Iterate(
         x.clone(), 0.2 * Sigma0, 0.9 * x.nan_to_num(1.0), T([9.0, 0.1, torch.inf, 1.0, 2.0]), torch.zeros(B, dtype=torch.bool)
     )
     limits = ekf.Limits()
-    expected = ekf.advance(start, prepared.normal(prepared.sums(x)), Sigma0, model.prior(), Q, limits)
+    prior = problem.mean, problem.precision
+    expected = ekf.advance(start, normal(problem, evaluate.sums(x)), Sigma0, prior, Q, limits)
     live = torch.tensor([0, 1, 3, 4])
     after = ekf.Iterate(*(getattr(start, k).clone() for k in ("x", "Sigma", "before", "cap", "done")))
-    prepared.iteration(after, Sigma0, Q, limits, sums)(live)
+    evaluate.iteration(Run(after, Sigma0, Q, sums, torch.ones(B, dtype=torch.bool)), limits)(live)
     for name in ("x", "Sigma", "before", "cap"):
         a, b = getattr(after, name), getattr(expected, name)
         assert torch.allclose(a[live], b[live], rtol=1e-7, atol=1e-9, equal_nan=True), name
@@ -157,31 +172,30 @@ def test_one_iteration_of_the_filter():
 
 
 def test_another_type_of_number_is_refused_before_the_kernel_writes_beyond_it():
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
-    prepared = Prepared(model, markers, model.weights(markers, 1e-3))
-    tables, index = prepared.tables(x), torch.arange(B)
+    problem, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
+    evaluate, index = KernelEvaluator(problem), torch.arange(B)
+    tables = evaluate.tables(x)
     with pytest.raises(TypeError, match=r"x is torch.float32.*torch.float64"):
         kernel.measure_now(x.float(), index, True, tables.structure, tables.markers)
     with pytest.raises(TypeError, match=r"index is torch.int32.*torch.int64"):
         kernel.measure_now(x, index.int(), True, tables.structure, tables.markers)
-    for call in (prepared.cost, prepared.sums, prepared.h):
+    for call in (evaluate.cost, evaluate.sums):
         with pytest.raises(TypeError, match=r"x is torch.float32"):
             call(x.float())
     with pytest.raises(TypeError, match=r"positions is torch.float32"):
-        tables.with_rows(markers.positions.float(), prepared.w, 4.0)
-    sums = kernel.Sums.room(B, model.size, 3)
-    Sigma0, Q = 0.5 * torch.eye(model.size).repeat(B, 1, 1), 0.1 * torch.ones(model.size)
+        tables.with_rows(problem.distances(problem.reading).float(), problem.weights, 4.0)
+    sums = kernel.Sums.room(B, problem.size, 15, 3)
+    Sigma0, Q = 0.5 * torch.eye(problem.size).repeat(B, 1, 1), 0.1 * torch.ones(problem.size)
     state = {"Sigma": Sigma0.clone(), "before": x.clone(), "cap": torch.ones(B), "done": torch.zeros(B, dtype=torch.bool)}
     for wrong in ({"x": x.float()}, {"x": x.clone(), "done": torch.zeros(B)}):
         with pytest.raises(TypeError, match=f"{list(wrong)[-1]} is torch"):
-            prepared.iteration(ekf.Iterate(**(state | wrong)), Sigma0, Q, ekf.Limits(), sums)
+            evaluate.iteration(Run(ekf.Iterate(**(state | wrong)), Sigma0, Q, sums, state["done"]), ekf.Limits())
 
 
 def test_gradients_and_transforms_go_through_the_operator():
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), True, "none")
-    tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
-    index = torch.arange(B)
-    h, H = model.linearized(x, markers)
+    problem, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), registration=Registration())
+    tables, index = KernelEvaluator(problem).tables(x), torch.arange(B)
+    h, H = problem.linearized(x)
 
     def measured(x):
         return kernel.measured(x, index, tables)
@@ -204,8 +218,8 @@ def test_gradients_and_transforms_go_through_the_operator():
 
 @pytest.mark.filterwarnings("ignore")
 def test_torch_compile_goes_through_the_operator():
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), False, "none")
-    tables = Prepared(model, markers, model.weights(markers, 1e-3)).tables(x)
+    problem, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0))
+    tables = KernelEvaluator(problem).tables(x)
 
     def cost(x):
         h, H, _ = kernel.measure(x, torch.arange(B), True, tables.tensors, tables.counts, tables.numbers)
@@ -215,8 +229,8 @@ def test_torch_compile_goes_through_the_operator():
     assert close(compiled(x), cost(x))
 
 
-def fits(model: Model, markers: Markers, settings: Settings | None = None):
-    return estimate(model, markers, 1e-3, settings, cold_start)
+def fits(problem: Problem, settings: Settings | None = None):
+    return estimate(problem, settings, cold_start)
 
 
 @pytest.mark.parametrize("kind", ["one contact", "two contacts", "tendons", "registration", "points"])
@@ -234,11 +248,12 @@ def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
         p = move(T([[0.005, -0.002, 0.003, 0.05, -0.02, 0.03]]), p)
     p = p + 1e-3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(3))
     points = kind == "points"
-    coordinates = PointCoordinates(n, 0.4, 1.0) if points else GaussianCoordinates(n, 0.4, 1.0)
-    model, markers = Model(robot, coordinates, kind == "registration", steps=20), Markers(s, p, None, tension)
-    compiled = fits(model, markers)
+    family = PointCoordinates(n, 0.4, 1.0) if points else GaussianCoordinates(n, 0.4, 1.0)
+    registration = Registration() if kind == "registration" else None
+    problem = posed(s, p, 1e-3, robot, family, tension, steps=20, registration=registration)
+    compiled = fits(problem)
     monkeypatch.setattr(kernel, "available", lambda: False)
-    plain = fits(model, markers)
+    plain = fits(problem)
     assert torch.equal(compiled.status, plain.status)
     assert torch.equal(compiled.iterations, plain.iterations)
     assert close(compiled.force, plain.force, 1e-8)
@@ -255,11 +270,11 @@ def test_all_iterations_at_once_are_those_one_by_one(most, monkeypatch):
     at, tension = 0.08 + 0.3 * torch.rand(29, 1, generator=generator), TENSION[torch.arange(29) % 3]
     p = solve_shape(robot, (PointForces(force, at),), tension, s, 29).p
     p[7] = torch.nan
-    model, markers = Model(robot, GaussianCoordinates(1, 0.4, 1.0)), Markers(s, p, None, tension)
+    problem = posed(s, p, 1e-3, robot, GaussianCoordinates(1, 0.4, 1.0), tension)
     settings = Settings(max_iterations=most, restarts=())
-    at_once = fits(model, markers, settings)
-    monkeypatch.setattr(Prepared, "at_once", False)
-    one_by_one = fits(model, markers, settings)
+    at_once = fits(problem, settings)
+    monkeypatch.setattr(KernelEvaluator, "iterate_all", lambda *_: None)
+    one_by_one = fits(problem, settings)
     assert torch.equal(at_once.status, one_by_one.status)
     assert torch.equal(at_once.iterations, one_by_one.iterations)
     assert (at_once.iterations.max() == most) == (most < 100)
