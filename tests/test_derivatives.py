@@ -7,8 +7,8 @@ from torch.autograd import forward_ad
 from tests.robots import steel_rod
 from tests.test_fast import needs_compiler
 from tests.test_fit import B, case, close
-from torchrod import GaussianCoordinates, kernel
-from torchrod.estimation.evaluator import Prepared
+from torchrod import GaussianCoordinates, Registration, kernel
+from torchrod.estimation.evaluator import KernelEvaluator
 
 pytestmark = needs_compiler
 
@@ -16,9 +16,9 @@ pytestmark = needs_compiler
 @pytest.fixture(scope="module")
 def problem():
     torch.set_default_dtype(torch.float64)
-    model, markers, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), True, "none")
-    tables = Prepared(model, markers, model.weights(markers, 1e-3), nu=4.0).tables(x)
-    h, H = model.linearized(x, markers)
+    posed, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), registration=Registration())
+    tables = KernelEvaluator(posed, nu=4.0).tables(x)
+    h, H = posed.linearized(x)
     return x, tables, h, H
 
 
