@@ -23,19 +23,19 @@ SAMPLES = EVERY if os.environ.get("TORCHROD_EVERY") else {"study1_1mm": 20, "two
 def parts(name: str):
     if name == "reference":
         return reference_parts(SAMPLES[name])
-    return [replace(p, markers=p.markers.take(torch.arange(SAMPLES[name]))) for p in make(name, False).parts]
+    return [replace(p, problem=p.problem.take(torch.arange(SAMPLES[name]))) for p in make(name, False).parts]
 
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_both_paths_find_the_same_loads(name, monkeypatch):
     for part in parts(name):
-        assert len(part.markers.positions) <= CHUNK_TORCH
+        assert part.problem.batch <= CHUNK_TORCH
         found = []
         for compiled in (True, False):
             with monkeypatch.context() as m:
                 if not compiled:
                     m.setattr(kernel, "available", lambda: False)
-                found.append(estimate(part.model, part.markers, part.noise, start=cold_start))
+                found.append(estimate(part.problem, start=cold_start))
         one, other = found
         assert torch.equal(one.status, other.status)
         assert torch.equal(one.accepted, other.accepted)
