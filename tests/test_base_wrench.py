@@ -17,7 +17,7 @@ from torchrod import (
 )
 
 S = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
-TURN = torch.nn.functional.normalize(T([0.1, -0.2, 0.3, 1.0]), dim=-1)
+TURN = torch.nn.functional.normalize(T([0.1, -0.2, 0.3, 1.0], dtype=torch.float64), dim=-1)
 
 
 def contact(robot) -> Unknowns:

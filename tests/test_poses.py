@@ -21,7 +21,7 @@ from torchrod import (
 from torchrod.mechanics.lie import exponential, product
 from torchrod.util.status import Status
 
-S = T([0.13, 0.27, 0.4])
+S = T([0.13, 0.27, 0.4], dtype=torch.float64)
 
 
 def seen(shape, noise: float, angle_noise: float, seed: int = 0) -> Poses:

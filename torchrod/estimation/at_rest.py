@@ -38,7 +38,9 @@ def at_rest(problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, 
     the definition and stays in stable equilibrium.
     """
     s, B, P, family = problem.s, len(gamma), len(problem.s), problem.unknowns.loads
-    plain = Problem(problem.robot, Unknowns(family), [Markers(s, s.new_empty(B, 0, 3), 1.0)], problem.tension, problem.coarse.steps)
+    plain = Problem(
+        problem.robot, Unknowns(family), [Markers(s, s.new_empty(B, len(s), 3), 1.0)], problem.tension, problem.coarse.steps
+    )
     wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
     settled = torch.zeros(B, dtype=torch.bool)
     light = problem.robot.gravity.ndim == 1 and math.isfinite(_weight(problem.robot))
@@ -64,7 +66,7 @@ def without_load(problem: Problem, s: Float[Tensor, " P"] | None = None) -> Rest
     none = Unknowns(GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale))
 
     def bare(count: int) -> Rest:
-        at = [Markers(s, s.new_empty(count, 0, 3), 1.0)]
+        at = [Markers(s, s.new_empty(count, len(s), 3), 1.0)]
         return at_rest(Problem(robot, none, at, problem.tension, problem.steps), s.new_zeros(count, 0))
 
     if problem.tension is not None or robot.gravity.ndim > 1:

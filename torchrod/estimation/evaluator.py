@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,6 +30,7 @@ from . import filter as ekf
 _layouts = Kept()
 
 
+@runtime_checkable
 class Evaluator(Protocol):
     """A problem made ready for the filter, which evaluates it many times.
 
@@ -349,6 +350,8 @@ def _layout(problem: Problem, x: Float[Tensor, "B n"] | None = None) -> Layout:
         "tensions": state.tension.size,
         "registration": int(state.registration.size > 0),
     }
+    # Copies: what is kept must not change with the tensors that it was worked out from.
+    tensors = {name: None if x is None else x.clone() for name, x in tensors.items()}
     return Layout(tensors, counts | loads | own, _units(problem), active)
 
 

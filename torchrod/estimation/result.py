@@ -369,7 +369,7 @@ def make_estimate(
         iterations=iterations,
         restarts=torch.zeros_like(iterations),
         status=status,
-        origin=origin,
-        guess=origin,
+        origin=origin.clone(),
+        guess=origin.clone(),
         fate=torch.zeros_like(origin),
     )

@@ -8,7 +8,7 @@ no nearer to the data than a cold one, and follows one that fails by a cold star
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -82,7 +82,7 @@ class Settings:
         if not all(0 < factor < math.inf for factor in self.restarts):
             raise ValueError(f"Settings.restarts is {self.restarts}; every factor must be positive and finite")
 
-    def initial_covariance(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "n n"]:
+    def initial_covariance(self, x: Float[Tensor, "*B n"]) -> Float[Tensor, "n n"]:
         """Sigma0 as a matrix."""
         return torch.diag(self.Sigma0 * x.new_ones(x.shape[-1]))
 
@@ -137,6 +137,7 @@ def linearize(problem: Problem, x: Float[Tensor, "B n"], w: Float[Tensor, "B z"]
     return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
 
 
+@runtime_checkable
 class Solver(Protocol):
     """What turns a problem and a start into an estimate."""
 
@@ -278,7 +279,7 @@ class Challenged:
         failed = chosen.challenged & ~fit.accepted & problem.usable
         fate = torch.zeros_like(start.origin)
         fate[dropped], fate[failed] = int(Fate.DROPPED), int(Fate.RETRIED)
-        fit = replace(fit, guess=start.origin, fate=fate)
+        fit = replace(fit, guess=start.origin.clone(), fate=fate)
         index = failed.nonzero().squeeze(-1)
         if len(index):
             part = problem.take(index)
@@ -303,8 +304,9 @@ def estimate_each(
     problem: Problem, settings: Settings | None = None, start: StartRule | Start = cold_start, progress: Progress = silent
 ) -> Estimate:
     """Fit every sample by itself, whatever the scope of its unknowns: see torchrod.estimate, which adds what samples share."""
-    problem = replace(problem)  # of this call: what it works out from tensors must not outlive a change of them
-    problem.check()
+    with torch.inference_mode(False):  # what is kept from call to call must serve outside of inference mode, too
+        problem = replace(problem)  # of this call: what it works out from tensors must not outlive a change of them
+        problem.check()
     if problem.robot.gravity.ndim != 1:
         raise ValueError("an estimate takes one gravity (3,) for all samples; estimate those of each gravity by themselves")
     parts, compiled, B = [], kernel_serves(problem), problem.batch

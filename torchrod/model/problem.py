@@ -23,7 +23,7 @@ from ..mechanics.loads import LoadIntegrals, total
 from ..mechanics.robot import Robot
 from ..mechanics.section import Section
 from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table, steps_of_rod
-from ..util.by_value import Kept
+from ..util.by_value import Kept, key
 from ..util.precision import DTYPE, Float64
 from .sensors import Markers, RodState, Sensor
 from .unknowns import State, Unknowns
@@ -53,6 +53,9 @@ _OF_READINGS = (
 @dataclass(frozen=True)
 class Problem(Float64):
     """Which robot, what is unknown, what was measured: all that an estimate needs (torchrod.estimate).
+
+    A problem is a value: what it has worked out from its tensors (state, weights, reading, ..) it keeps. torchrod.estimate works on
+    a copy and follows tensors that were changed in place; for anything else make a new problem after such a change.
 
     robot: known but for the unknowns. unknowns: what is to be estimated of each sample. sensors: what was read of B samples, with
     its noise; their rows stand one after the other in h. tension: (B, T) N for a tendon robot, the readings of its load cells.
@@ -84,7 +87,7 @@ class Problem(Float64):
     @cached_property
     def state(self) -> State:
         """The blocks of x, bound to this robot's scales."""
-        scales = self.unknowns, self.robot.rod.length, self.robot.rod.bending_stiffness, len(self.robot.tendons)
+        scales = key(self.unknowns), self.robot.rod.length, self.robot.rod.bending_stiffness, len(self.robot.tendons)
         return _states(scales, lambda: self.unknowns.state(self.robot))
 
     @property

@@ -22,6 +22,10 @@ def key(value: Any) -> Any:
         return tuple(map(key, value))
     if is_dataclass(value):
         return type(value), *(key(getattr(value, f.name)) for f in fields(value))
+    try:
+        hash(value)
+    except TypeError:
+        return object()  # an object of a user's own that cannot be told from another: nothing is kept of it
     return value
 
 

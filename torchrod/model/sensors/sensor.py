@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -65,15 +65,15 @@ class Sensor(Protocol):
         """Those of its rows that are positions (m), three for each place; none for a sensor without."""
         ...
 
-    def take(self, index: Int[Tensor, " b"]) -> Self:
+    def take(self, index: Int[Tensor, " b"]) -> "Sensor":
         """The samples of an index."""
         ...
 
-    def without(self, groups: Bool[Tensor, "B G"]) -> Self:
+    def without(self, groups: Bool[Tensor, "B G"]) -> "Sensor":
         """The same with the rows of these groups not read."""
         ...
 
-    def moved(self, R: Matrix, t: Vector) -> Self:
+    def moved(self, R: Matrix, t: Vector) -> "Sensor":
         """The same readings in the frame p' = R p + t (a rotation matrix, m): for a base frame that has become known."""
         ...
 
