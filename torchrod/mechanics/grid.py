@@ -32,12 +32,12 @@ class Grid:
     @property
     def outputs_and_tip(self) -> Int[Tensor, "... P1"]:
         """The outputs' nodes, and the last node."""
-        return torch.cat([self.outputs, torch.full_like(self.outputs[..., :1], self.nodes.shape[-1] - 1)], -1)
+        return torch.cat([self.outputs, self.outputs.new_full((*self.outputs.shape[:-1], 1), self.nodes.shape[-1] - 1)], -1)
 
     @property
     def outputs_and_base(self) -> Int[Tensor, "... P1"]:
         """The outputs' nodes, and the first node."""
-        return torch.cat([self.outputs, torch.zeros_like(self.outputs[..., :1])], -1)
+        return torch.cat([self.outputs, self.outputs.new_zeros(*self.outputs.shape[:-1], 1)], -1)
 
     def cut(self, pieces: int) -> Int[Tensor, "... n"]:
         """The nodes at or just beyond the ends of so many equal pieces."""
