@@ -9,8 +9,10 @@ so these are the equilibria of the rod from s to its tip nearest to the one at h
     J. H. Maddocks, Proc. R. Soc. A 454, 1998). None: a strict minimum, the rod rests there. Any: it leaves at the least touch.
 (3) From one node to the next Theta is multiplied by I - h K^-1 P with P symmetric but for terms that vanish with h, so its
     eigenvalues are real, and every negative one is a conjugate point in the step. Two at once, as in a round column, both count.
-(4) There is none for sure where, with the least stiffness K and n, m the most that a section carries,
-        (2 L / pi)^2 |n| + (2 L / pi) |m| < K        by Poincare's inequality in the second variation.
+(4) There is none for sure where, with the least stiffness K and the forces and moments n(s), m(s) that a section carries,
+        int_0^L |n| s ds + (int_0^L m^2 s ds)^(1/2) < K
+    because th(0) = 0 makes |th(s)|^2 <= s int |th'|^2, and the second variation is at least
+        int_0^L K |th'|^2 - |m| |th| |th'| - |n| |th|^2.
 
 The energy is that of loads that keep their direction in the base frame, of weight and of tendons. A load that turns with the
 section and a dead moment have none: there (1) still says where equilibria meet and part, and the count is that of divergence;
@@ -26,7 +28,6 @@ from torch import Tensor
 from .lie import Matrix, Quaternion, exponential, inverse3, normalized, product, turned
 from .tip_problem import SETTLED, TipProblem, angle_between, newton, smallest
 
-POINCARE = 2 / math.pi  # |th| <= POINCARE L |th'| for th(0) = 0
 INCREMENT_TOLERANCE = 1e-3  # rad: enough on the way to the full load, but where solutions are about to meet
 NEARLY_SINGULAR = 0.25  # of Theta(0), whose singular values are 1 without load: solutions are about to meet
 WIDE_TURN, NARROW_TURN = 1.5, 0.2  # rad: how far the tip may turn in one increment at most, and where solutions meet

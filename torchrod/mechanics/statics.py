@@ -24,7 +24,7 @@ from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logar
 from .loads import Load, LoadIntegrals, taken, total
 from .robot import Robot
 from .section import STATE_PARTS, Section, StageTable, State, section_wrench
-from .stability import POINCARE, conjugate_points, follow
+from .stability import conjugate_points, follow
 from .tendons import strains_settled
 from .tip_problem import ORIENTATION_TOLERANCE, SETTLED, TipProblem, newton, turning
 
@@ -172,25 +172,47 @@ class Equilibrium:
 
 @dataclass(frozen=True)
 class _Sizes:
-    """The largest force (N) and moment (N m) at any section, per sample: of loads that keep their direction, and of the others."""
+    """How much a section carries, per sample: of loads that keep their direction (dead), and of the others.
+
+    The largest force (N) and moment (N m), and what (4) of mechanics.stability makes of them all along (N m^2).
+    """
 
     dead_force: Float[Tensor, " B"]
     dead_moment: Float[Tensor, " B"]
     force: Float[Tensor, " B"]
     moment: Float[Tensor, " B"]
+    dead_softening: Float[Tensor, " B"]
+    softening: Float[Tensor, " B"]
 
     @classmethod
     def of(cls, problem: TipProblem, length: float) -> "_Sizes":
-        """From the integrals of the loads; a force at most L away makes a moment."""
-        loads, zero = problem.table.loads, torch.zeros(len(problem.wrench), dtype=problem.wrench.dtype)
+        """From the integrals of the loads at the start of every step; m(s) is at most the forces beyond s with their levers."""
+        loads, zero = problem.table.loads, torch.zeros(len(problem.wrench), 1, dtype=problem.wrench.dtype)
         N, M = problem.wrench.detach().split(3, -1)
+        nodes = problem.grid.nodes.detach()
+        h, end = nodes.diff(dim=-1), nodes[..., 1:]
 
-        def largest(x: Vector | None) -> Float[Tensor, " B"]:
-            return zero if x is None else zero + x.detach().norm(dim=-1).flatten(-2).amax(-1)
+        def sizes(x: Vector | None) -> Float[Tensor, "B S"]:
+            return zero.expand(-1, h.shape[-1]) if x is None else zero + x.detach()[..., 0, :].norm(dim=-1)
 
-        n, m = largest(loads.Wn), largest(loads.Wm)
-        G = largest(N[:, None, None, :] if loads.G is None else N[:, None, None, :] - loads.G)  # what lies beyond a section
-        return cls(n, n * length + m, G, torch.maximum(G * length + largest(loads.Gm), M.norm(dim=-1)))
+        def softening(n: Float[Tensor, "B S"], m: Float[Tensor, "B S"]) -> Float[Tensor, " B"]:
+            return (n * end * h).sum(-1) + (m.square() * end * h).sum(-1).sqrt()
+
+        def levered(n: Float[Tensor, "B S"]) -> Float[Tensor, "B S"]:
+            return (n * h).flip(-1).cumsum(-1).flip(-1)
+
+        n, m = sizes(loads.Wn), sizes(loads.Wm)
+        G = sizes(N[:, None, None, :] if loads.G is None else N[:, None, None, :] - loads.G)  # what lies beyond a section
+        Gm = torch.maximum(sizes(loads.Gm), M.norm(dim=-1, keepdim=True) if loads.G is None else 0 * zero)
+        largest_n, largest_G = n.amax(-1), G.amax(-1)
+        return cls(
+            largest_n,
+            largest_n * length + m.amax(-1),
+            largest_G,
+            torch.maximum(largest_G * length + Gm.amax(-1), M.norm(dim=-1)),
+            softening(n, levered(n) + m),
+            softening(G, levered(G) + Gm),
+        )
 
     def in_units(self, robot: Robot) -> Float[Tensor, " B"]:
         """Loads of the base frame, in EI / L^2."""
@@ -200,9 +222,7 @@ class _Sizes:
 
     def unique_below(self, robot: Robot) -> Float[Tensor, " B"]:
         """The fraction of the base frame's loads up to which (4) of mechanics.stability holds."""
-        a, K = POINCARE * robot.rod.length, robot.rod.softest
-        dead, local = a * (a * self.dead_force + self.dead_moment), a * (a * self.force + self.moment)
-        return ((K - local) / dead.clamp(min=1e-300)).clamp(min=0.0)
+        return ((robot.rod.softest - self.softening) / self.dead_softening.clamp(min=1e-300)).clamp(min=0.0)
 
     def pieces(self, robot: Robot) -> int:
         """Into how many the rod is cut to count its conjugate points: a piece is short beside the waves that the loads make."""
