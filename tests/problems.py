@@ -2,10 +2,11 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from tests.robots import steel_rod
-from torchrod import GaussianCoordinates, Markers, Problem, Robot, Unknowns
+from torchrod import GaussianCoordinates, Markers, Problem, Robot, Unknowns, forward_jacobian
 
 
 def posed(
@@ -30,3 +31,16 @@ def unknowns_of(
 ) -> Unknowns:
     """So many Gaussian loads on a robot; rest: as in Unknowns."""
     return Unknowns(GaussianCoordinates(count, robot.rod.length, robot.rod.force_scale, prior, locations), **rest)
+
+
+def check_jacobian(problem: Problem) -> None:
+    """H of a problem near its start, against torch.func through the whole of h and against central differences."""
+    x = 0.3 * torch.randn(problem.batch, problem.size, generator=torch.Generator().manual_seed(0))
+    h, H = problem.linearized(x)
+    other, J = forward_jacobian(problem.h, x)
+    assert torch.allclose(h, other, rtol=0, atol=1e-12)
+    assert torch.allclose(H, J, rtol=1e-9, atol=1e-10)
+    step = 1e-6 * torch.eye(problem.size)
+    for k in range(problem.size):
+        slope = (problem.h(x + step[k]) - problem.h(x - step[k])) / 2e-6
+        assert torch.allclose(slope, H[..., k], rtol=1e-6, atol=1e-6)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.problems import check_jacobian
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import (
     BaseWrench,
@@ -12,7 +13,6 @@ from torchrod import (
     Problem,
     Unknowns,
     estimate,
-    forward_jacobian,
     solve_shape,
 )
 
@@ -36,15 +36,7 @@ def test_the_jacobian_is_that_of_h_and_of_differences():
     robot = busy_robot()
     sensors = [Markers(S, torch.zeros(2, 20, 3), 1e-3), BaseWrench(torch.zeros(2, 6), 0.01, 1e-3, TURN)]
     problem = Problem(robot, contact(robot), sensors, T([[3.0, 2.0], [1.0, 2.0]]), 10)
-    x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0))
-    h, H = problem.linearized(x)
-    other, J = forward_jacobian(problem.h, x)
-    assert torch.allclose(h, other, rtol=0, atol=1e-12)
-    assert torch.allclose(H, J, rtol=1e-9, atol=1e-10)
-    step = 1e-6 * torch.eye(problem.size)
-    for k in range(problem.size):
-        slope = (problem.h(x + step[k]) - problem.h(x - step[k])) / 2e-6
-        assert torch.allclose(slope, H[..., k], rtol=1e-6, atol=1e-6)
+    check_jacobian(problem)
 
 
 def test_it_reads_what_the_rod_puts_on_its_base():

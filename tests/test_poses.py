@@ -4,6 +4,7 @@ import pytest
 import roma
 import torch
 
+from tests.problems import check_jacobian
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import (
     GaussianCoordinates,
@@ -15,7 +16,6 @@ from torchrod import (
     Registration,
     Unknowns,
     estimate,
-    forward_jacobian,
     solve_shape,
 )
 from torchrod.mechanics.lie import exponential, product
@@ -53,15 +53,7 @@ def test_the_jacobian_is_that_of_h_and_of_differences():
     poses = Poses(S, torch.zeros(2, 3, 3), q, 1e-3, 0.01, 0.01 * torch.ones(3, 3), mounting)
     unknowns = Unknowns(GaussianCoordinates(1, 0.4, 1.0), "force", None, Registration())
     problem = Problem(robot, unknowns, [poses], tension, 10)
-    x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0))
-    h, H = problem.linearized(x)
-    other, J = forward_jacobian(problem.h, x)
-    assert torch.allclose(h, other, rtol=0, atol=1e-12)
-    assert torch.allclose(H, J, rtol=1e-9, atol=1e-10)
-    step = 1e-6 * torch.eye(problem.size)
-    for k in range(problem.size):
-        slope = (problem.h(x + step[k]) - problem.h(x - step[k])) / 2e-6
-        assert torch.allclose(slope, H[..., k], rtol=1e-6, atol=1e-6)
+    check_jacobian(problem)
 
 
 def test_the_right_shape_leaves_no_residual():
