@@ -17,6 +17,7 @@ from ..estimation import filter as ekf
 from ..estimation.result import ACCEPT, Z95
 from ..estimation.solve import Settings
 from ..mechanics.robot import Robot
+from ..mechanics.statics import steps_of_rod
 from ..mechanics.tendons import Tendons
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
@@ -124,6 +125,7 @@ def calibrate(
     """
     none = Unknowns(GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale))
     Problem(robot, none, [markers], tension).check()
+    steps = steps or steps_of_rod(robot, markers.s)  # the same for every trial, or their differences would jump
     shapes = UnloadedShapes(robot, markers, tension, markers.weights[:, ::3], youngs_modulus, tension_offset, steps)
     _refuse(shapes)
     return _result(shapes, *_iterate(shapes, settings or Settings()))

@@ -66,7 +66,7 @@ class UnloadedShapes:
     weights: Float[Tensor, "B P"]
     stiffness: bool
     offsets: bool
-    steps: int | None
+    steps: int
 
     @property
     def names(self) -> tuple[str, ...]:
