@@ -57,7 +57,7 @@ def produce(
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Processes that begin within it never hear of Ctrl-C, from their first import on: the command alone has something to say of it.
+    """Processes that begin within it never hear of Ctrl-C, from their first import on: the command alone speaks of it.
 
     The command itself hears of it at the end.
     """
