@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -53,15 +54,16 @@ def produce(
 
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
-    """Processes that begin within it ignore Ctrl-C, from their first import on: the command alone has something to say of it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Processes that begin within it never hear of Ctrl-C, from their first import on: the command alone speaks of it.
+
+    The command itself hears of it at the end.
+    """
+    resource_tracker.ensure_running()  # where it is not, starting it would let the signal through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _leave_with_parent() -> None:
