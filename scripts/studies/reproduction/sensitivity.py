@@ -164,7 +164,7 @@ def run(quick: bool, folder: Path) -> tuple[dict[str, Any], list[str]]:
     data["beam_magnitude_N"] = {f"{a:g}": float(v) for a, v in zip(PLACES, c.beam[:, 0, 0], strict=True)}
     data["beam_location_m_at_1_N"] = {f"{a:g}": float(v) for a, v in zip(PLACES, c.beam[:, 1, 1], strict=True)}
     _beam_figure(robot, folder / "figure3.png")
-    _force_figure(c, folder / "figure4.png")
+    _force_figure(c, folder / "figure4.png", quick)
     return data, _lines(data)
 
 
@@ -261,12 +261,12 @@ def _beam_figure(robot: Robot, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _force_figure(c: Curves, path: Path) -> None:
+def _force_figure(c: Curves, path: Path, quick: bool) -> None:
     """Top: the paper's, (8). Bottom: the rod of the studies; rows magnitude and location, columns one at a time and jointly."""
     figure = Figure(figsize=(10, 15.5), layout="constrained")
     halves = figure.add_gridspec(2, 1, height_ratios=(1, 1))
     top, bottom = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
-    draw_rod(top)
+    draw_rod(top, quick)
     grid = bottom.subplots(2, 2, sharex=True, sharey="row")
     for k, unit in enumerate(("magnitude (N)", "location (mm)")):
         for column, (values, title) in enumerate(((c.alone, "the other parameter known"), (c.jointly, "both unknown"))):

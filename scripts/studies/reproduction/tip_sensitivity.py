@@ -24,7 +24,7 @@ from .sinusoids import printed_beam
 
 L, EI, STEPS = 1.0, 1.0, 40
 FORCES, PLACES = (0.1, 1.0, 2.0, 5.0, 8.0), (0.25, 0.5, 0.75, 0.95)  # N, m: of the table
-GRID = 33  # values of force and of location in the figures
+GRID, QUICK_GRID = 33, 13  # values of force and of location in the figures
 MOST = 8.0  # N: at 0.95 m it turns the tip by 150 degrees, and beyond it the tip points backwards
 POINTS = 20  # evenly spaced, the last at the tip: what more measured points are worth
 COLOURS = ("#1b2a41", "#0a7f8c", "#e08a1e", "#c8102e")  # of PLACES
@@ -139,23 +139,23 @@ def _map(figure: SubFigure, axes: Axes, F: Tensor, mu: Tensor, values: Tensor, n
     axes.set_title(NAMES[name][1], fontsize=10)
 
 
-def _mesh() -> tuple[Tensor, Tensor]:
-    F, mu = torch.linspace(0.1, MOST, GRID, dtype=torch.float64), torch.linspace(0.1, 0.99, GRID, dtype=torch.float64)
+def _mesh(count: int) -> tuple[Tensor, Tensor]:
+    F, mu = torch.linspace(0.1, MOST, count, dtype=torch.float64), torch.linspace(0.1, 0.99, count, dtype=torch.float64)
     F, mu = torch.meshgrid(F, mu, indexing="ij")
     return F, mu
 
 
 def draw_beam(figure: SubFigure) -> None:
     """The paper's Figure 3."""
-    F, mu = _mesh()
+    F, mu = _mesh(GRID)
     for axes, values, name in zip(figure.subplots(1, 2), beam_by_tip(F, mu), NAMES, strict=True):
         _map(figure, axes, F, mu, values, name)
     figure.suptitle("Paper's Figure 3, (7): what 1 m of tip deflection means, Euler-Bernoulli, L = 1 m, EI = 1 N m²", fontsize=11)
 
 
-def draw_rod(figure: SubFigure) -> None:
-    """The paper's Figure 4, and cuts through it with (7) and with more points."""
-    F, mu = _mesh()
+def draw_rod(figure: SubFigure, quick: bool) -> None:
+    """The paper's Figure 4, on a coarser grid if quick, and cuts through it with (7) and with more points."""
+    F, mu = _mesh(QUICK_GRID if quick else GRID)
     both = one_at_a_time(_by_points(1, F, mu))
     grid = figure.subplots(2, 2)
     force = torch.logspace(-1, math.log10(MOST), 18, dtype=torch.float64)
