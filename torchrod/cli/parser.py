@@ -75,7 +75,12 @@ def _estimate_parser() -> ArgumentParser:
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
-    parser.add_argument("--steps", type=Steps, default=None, help="least number of arc-length steps; by the reference shape")
+    parser.add_argument(
+        "--steps",
+        type=Steps,
+        default=None,
+        help="least number of steps along the rod; by default as many as the unloaded shape needs",
+    )
     parser.add_argument("--max-iterations", type=int, default=100, help="give a sample up after this many")
     return parser
 
