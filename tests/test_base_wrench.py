@@ -79,6 +79,13 @@ def test_the_intervals_hold_the_truth():
         assert 0.92 < share < 0.98, share
 
 
+def test_forces_and_moments_weigh_by_their_own_noise():
+    """Noises of two sizes and units, one of them for each sample: exchanged, or one taken for both, the weights are others."""
+    sensor = BaseWrench(torch.zeros(2, 6), 0.1, T([0.01, 0.02]))
+    assert torch.allclose(sensor.weights[:, :3], torch.full((2, 3), 100.0))
+    assert torch.allclose(sensor.weights[:, 3:], T([[1e4] * 3, [2.5e3] * 3]))
+
+
 def test_a_missing_reading_weighs_nothing():
     _, _, shape = pushed()
     markers = Markers(S, shape.p, 1e-3)
