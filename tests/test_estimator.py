@@ -238,10 +238,11 @@ def test_a_strong_push_near_the_tip_is_found_by_a_restart():
     force, place = T([[[4.91, 0.0, 0.0]], [[0.0, 3.99, 0.0]], [[0.5, 0.0, 0.0]]]), T([[0.379], [0.398], [0.2]])
     shape = solve_shape(robot, (PointForces(force, place),), None, s, 3, 160)
     problem = posed(s, shape.p)
-    once = estimate(problem, Settings(restarts=()))
+    once = estimate(problem, Settings(restarts=(), basins=0))
     assert once.accepted.tolist() == [False, False, True]
-    fit = estimate(problem)
+    fit = estimate(problem, Settings(basins=0))
     assert fit.accepted.all()
+    assert estimate(problem, Settings(restarts=())).accepted.all(), "a start elsewhere finds them as well"
     assert (fit.restarts > 0).tolist() == [True, True, False]
     assert (fit.iterations >= once.iterations).all()
     assert torch.allclose(fit.magnitude, force.norm(dim=-1), rtol=0.02)
@@ -268,13 +269,11 @@ def test_coordinates_of_your_own_are_fitted_as_well():
     assert torch.allclose(own.location, known.location, rtol=1e-8)
 
 
-def test_the_last_update_is_taken_and_the_cost_is_of_the_evaluation_before_it():
+def test_the_last_update_is_taken_and_the_cost_is_what_it_promises():
     problem = study1(40).problem(1e-3, "contact", 1e-3)
     fit = estimate(problem)
     at = linearize(problem, fit.x)
-    gained = fit.cost - at.cost
-    assert -1e-9 < float(gained.min()) < float(gained.max()) < 1e-3, "no more than what counts as converged"
-    assert float(gained.max()) > 2e-4, "and some samples had that left"
+    assert float((fit.cost - at.cost).abs().max()) < 1e-4
     assert float(at.decrement.max()) < 4e-4
 
 

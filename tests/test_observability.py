@@ -15,6 +15,7 @@ from torchrod import Markers, PointForces, Problem, Registration, Robot, Rod, bo
 from torchrod.analysis.marker_placement import KNOWN, _information, even_layout
 from torchrod.analysis.observability import covariance, held, noncentrality, push_problem, pushed, seen_by, sensitivity
 from torchrod.cli import main
+from torchrod.estimation import filter as ekf
 
 AT = torch.linspace(0.04, 0.36, 5, dtype=torch.float64)
 S = torch.linspace(0.04, 0.4, 10, dtype=torch.float64)
@@ -43,7 +44,7 @@ def test_the_bound_is_the_scatter_of_estimates():
 
 
 def test_the_bound_is_that_of_the_whole_state():
-    """Alpha eliminated by (17) against alpha in the state and (17) as weight, as in the covariance of a result."""
+    """Alpha eliminated before the march against alpha in the state and (17) as a condition, as in the covariance of a result."""
     robot, s = busy_robot(), T([0.1, 0.2, 0.3, 0.4])
     force, at, tension = T([[0.6, -0.35], [0.2, 0.5]]), T([0.25, 0.35]), T([[3.0, 2.0]]).expand(2, -1)
     problem = push_problem(robot, Markers(s, torch.zeros(2, 4, 3), 1e-3), tension, Registration())
@@ -53,12 +54,13 @@ def test_the_bound_is_that_of_the_whole_state():
     assert not singular.any()
     _, H = problem.linearized(x)
     H = torch.cat([H[..., :3], H[..., 4:]], -1)
-    w = problem.exact_weights
-    A = H.mT @ (w.unsqueeze(-1) * H) + torch.diag(torch.cat([torch.zeros(3), problem.precision[4:]]))
-    whole = torch.linalg.inv(A).diagonal(dim1=-2, dim2=-1)[:, :3]
+    normal = ekf.normal_equations(H, torch.zeros_like(H[..., 0]), problem.weights, problem.groups)
+    A = normal.A[:, 0] + torch.diag(torch.cat([torch.zeros(3), problem.precision[4:]]))
+    assert normal.tip is not None
+    whole = normal.tip.solve(A, torch.zeros_like(A[..., 0]))[1].diagonal(dim1=-2, dim2=-1)[:, :3]
     t = at / 0.4
     ours = C.diagonal(dim1=-2, dim2=-1)[:, :3] * torch.stack([torch.ones(2), torch.ones(2), (t * (1 - t)) ** -2], -1)
-    assert torch.allclose(ours, whole, rtol=0.01)
+    assert torch.allclose(ours, whole, rtol=1e-6)
 
 
 def test_a_straight_rod_is_beam_theory():

@@ -152,8 +152,8 @@ def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, 
     """The filter on theta: estimation.filter's `advance` on a batch of one."""
     mean, limits = shapes.start(), ekf.Limits(step=settings.step_limit)
     prior, Q = (mean, torch.full_like(mean, PRIOR)), settings.Q * torch.ones_like(mean)
-    Sigma0, cap = settings.initial_covariance(mean)[None], torch.full((1,), torch.inf if settings.adaptive else 0.0, dtype=DTYPE)
-    at = ekf.Iterate(mean[None], Sigma0, mean[None], cap, torch.zeros(1, dtype=torch.bool))
+    Sigma0 = settings.initial_covariance(mean)[None]
+    at = ekf.Iterate.start(mean[None], Sigma0, torch.inf if settings.adaptive else 0.0)
     kept, retreats = torch.zeros(len(shapes.weights), dtype=torch.bool), 0
     for iteration in range(1, settings.max_iterations + 1):
         trial = shapes.linearize(at.x[0], mean)
@@ -184,7 +184,7 @@ def _result(shapes: UnloadedShapes, theta: Float[Tensor, " n"], trial: Trial, it
     prior = torch.diag(torch.full_like(theta, PRIOR))
     values, log, names = shapes.physical(theta), shapes.logarithmic, shapes.names
     unknown = math.nan if status is not Status.CONVERGED else 1.0
-    stated, std = (unknown * ekf.posterior(trial.A_mean / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess))
+    stated, std = (unknown * ekf.inverse(trial.A_mean / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess))
     size = torch.where(log, values, shapes.unit)
     reach = Z95 * torch.stack([-std, std], -1)
     around = values.unsqueeze(-1)

@@ -106,8 +106,7 @@ def sensitivity(problem: Problem, x: Float[Tensor, "B n"], unknown: tuple[int, .
     In units of the force scale, of L for the location, and of Problem.state for zeta.
 
     (2) The tip residual (17) is zero in truth: dc = C_t dt + C_a d(alpha) = 0 with t = [load, zeta] and C_t, C_a blocks of H.
-    (3) Hence d(alpha) = -C_a^-1 C_t dt and dp = (H_t - H_a C_a^-1 C_t) dt: what (1) tends to as the weight of c grows. Problem's
-        exact_weights come within 1 % of it, but leave a matrix that round-off can make singular.
+    (3) Hence d(alpha) = -C_a^-1 C_t dt and dp = (H_t - H_a C_a^-1 C_t) dt: what (1) tends to as the weight of c grows.
     """
     rows, g, base = [], problem.state.loads.size, problem.state.base.at
     for first in range(0, len(x), CHUNK):

@@ -83,14 +83,21 @@ def score_test(problem: Problem, x: Float[Tensor, "B n"]) -> ScoreTest:
     places = tuple(L * (j + 1) / PLACES for j in range(PLACES))
     wide = problem.of(replace(problem.unknowns, loads=_WithCandidates(fitted, places)))
     nothing = x.new_zeros(len(x), 2 * PLACES)
-    # With the tip condition as stiff as it is in truth: its slack would take up part of what a weak load does.
-    at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), problem.exact_weights)
+    # In equilibrium: slack at the tip would take up part of what a weak load does.
+    at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), exact=True)
+    assert at.tip is not None
+    A, gradient = at.tip.reduced(at.A, at.g)
     c = torch.arange(g, g + 2 * PLACES)
-    b = torch.cat([torch.arange(g), torch.arange(g + 2 * PLACES, n + 2 * PLACES)])
-    A_bc = at.A[:, b][:, :, c]
-    both = ekf.solve_spd(at.A[:, b][:, :, b], torch.cat([A_bc, at.g[:, b].unsqueeze(-1)], -1))
-    A_cc = at.A[:, c][:, :, c] - A_bc.mT @ both[..., :-1]
-    g_c = at.g[:, c] - (A_bc.mT @ both[..., -1:]).squeeze(-1)
+    b = torch.cat([torch.arange(g), torch.arange(g + 2 * PLACES, n - ekf.BASE + 2 * PLACES)])
+    A_bc = A[:, b][:, :, c]
+    both = ekf.solve_spd(A[:, b][:, :, b], torch.cat([A_bc, gradient[:, b].unsqueeze(-1)], -1))
+    A_cc = A[:, c][:, :, c] - A_bc.mT @ both[..., :-1]
+    g_c = gradient[:, c] - (A_bc.mT @ both[..., -1:]).squeeze(-1)
+    # And how the base wrench follows: T of those that stay, T of the new force, d.
+    follows = torch.cat(
+        [at.tip.T[:, :, c] - at.tip.T[:, :, b] @ both[..., :-1], at.tip.d.unsqueeze(-1) - at.tip.T[:, :, b] @ both[..., -1:]], -1
+    )
+    both = torch.cat([both, follows], 1)
     pair = 2 * torch.arange(PLACES).unsqueeze(-1) + torch.arange(2)
     S = A_cc[:, pair.unsqueeze(-1), pair.unsqueeze(-2)]
     F = ekf.solve_spd(S.flatten(0, 1), g_c[:, pair].flatten(0, 1).unsqueeze(-1)).squeeze(-1).unflatten(0, (-1, PLACES))

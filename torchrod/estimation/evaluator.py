@@ -23,7 +23,7 @@ from ..mechanics.loads import total
 from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
-from ..model.problem import TIP_EXACT, Problem
+from ..model.problem import TIP_ROWS, Problem
 from ..util.by_value import Kept, key
 from . import filter as ekf
 
@@ -60,7 +60,7 @@ class Evaluator(Protocol):
         ...
 
     def posterior(self, sums: kernel.Sums, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
-        """From the sums at x: the covariance, with a tip residual TIP_EXACT times as stiff, and the cost of (3) with the prior."""
+        """From the sums at x: the covariance, in equilibrium, and the cost of (3) with the prior: see filter.Normal.posterior."""
         ...
 
     def iteration(self, run: "Run", limits: ekf.Limits) -> Callable[[Int[Tensor, " b"]], None]:
@@ -150,13 +150,13 @@ class TorchEvaluator:
         h, H = problem.linearized(x)
         r = self.residual(h)
         N = ekf.normal_equations(H, r, problem.weights, problem.groups, self.nu)
-        return kernel.Sums(N.A, N.g, N.cost, r, problem.shape(x, differentiable=False).p)
+        C = H[:, len(problem.groups) :].contiguous()
+        return kernel.Sums(N.A, N.g, N.cost, C, r, problem.shape(x, differentiable=False).p)
 
     def posterior(self, sums: kernel.Sums, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
         """See Evaluator."""
-        prior, N = (self.problem.mean, self.problem.precision), normal(self.problem, sums)
-        A, _, _ = N.exact(TIP_EXACT).whole(x, *prior)
-        return ekf.posterior(A), N.whole(x, *prior)[2]
+        problem = self.problem
+        return normal(problem, sums).posterior(x, problem.mean, problem.precision, problem.exact_tip)
 
     def iteration(self, run: Run, limits: ekf.Limits) -> Callable[[Int[Tensor, " b"]], None]:
         """See Evaluator."""
@@ -176,7 +176,7 @@ class TorchEvaluator:
 
 def normal(problem: Problem, sums: kernel.Sums) -> ekf.Normal:
     """The normal equations as estimation.filter has them."""
-    return ekf.Normal(sums.A, sums.g, sums.cost, problem.seen)
+    return ekf.Normal(sums.A, sums.g, sums.cost, problem.seen, ekf.TipCondition.of(sums.C, sums.r[:, -TIP_ROWS:]))
 
 
 @dataclass(frozen=True)
@@ -211,11 +211,11 @@ class KernelEvaluator:
     def sums(self, x: Float[Tensor, "B n"]) -> kernel.Sums:
         """See Evaluator."""
         t = self.tables(x)
-        return kernel.Sums(*kernel.normal_equations_now(x, t.structure, t.markers))
+        return kernel.normal_equations_now(x, t.structure, t.markers)
 
     def posterior(self, sums: kernel.Sums, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
         """See Evaluator."""
-        return kernel.posterior_now(sums, x, self.problem.mean, self.problem.precision, TIP_EXACT**2)
+        return kernel.posterior_now(sums, x, self.problem.mean, self.problem.precision, self.problem.exact_tip)
 
     def balance(
         self, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float

@@ -16,7 +16,10 @@ which needs n x n algebra only (n unknowns, far fewer than measurements): 12-21 
     (5)  Lambda = Sigma_bar^-1 + H^T W H + P,    x+ = x + Lambda^-1 (H^T W (z - h) + P (x0 - x))
 
 Sigma_bar^-1 acts as Levenberg-Marquardt damping: a larger Q means LESS damping (the paper says the reverse). Because (3) counts
-the same data at every iteration, Sigma+ is not the posterior covariance; that is (H^T W H + P)^-1, see `posterior`.
+the same data at every iteration, Sigma+ is not the posterior covariance; that is (H^T W H + P)^-1.
+
+The tip residual c (17) is no measurement: it is zero. Far from the answer it is weighed like one, which eases the way; near it, x
+moves where c(x) = 0 to first order (`TipCondition`), and so does the posterior.
 """
 
 import math
@@ -27,6 +30,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+TURN = 0.1  # a step turns back that undoes a last one of at least this part of it
+BASE = 6  # entries of the base wrench alpha, the last of x
 Information = tuple[Float[Tensor, "B n n"], Float[Tensor, "B n"]]
 
 
@@ -64,26 +69,94 @@ def predict(Sigma: Float[Tensor, "B n n"], Q: Float[Tensor, " n"]) -> Float[Tens
     return Sigma + torch.diag(Q)
 
 
+def inverse(A: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
+    """A^-1 by `solve_spd`."""
+    return solve_spd(A, torch.eye(A.shape[-1], dtype=A.dtype).expand_as(A))
+
+
 def update(
-    Sigma_bar: Float[Tensor, "B n n"], A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]
-) -> tuple[Float[Tensor, "B n"], Float[Tensor, "B n n"]]:
-    """(5): the step x+ - x and Sigma+, from the predicted covariance and the information of the data and the prior."""
-    eye = torch.eye(A.shape[-1], dtype=A.dtype)
-    Lambda = solve_spd(Sigma_bar, eye.expand_as(A)) + A
-    both = solve_spd(Lambda, torch.cat([g.unsqueeze(-1), eye.expand_as(A)], -1))
-    Sigma = both[..., 1:]
-    return both[..., 0], 0.5 * (Sigma + Sigma.mT)
+    Sigma_bar: Float[Tensor, "B n n"], A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"], tip: "TipCondition | None" = None
+) -> tuple[Float[Tensor, "B n"], Float[Tensor, "B n n"], Float[Tensor, " B"]]:
+    """(5): the step x+ - x, Sigma+ and step^T Lambda step, the decrement that the damped step promises, from the predicted
+    covariance and the information of the data and the prior; tip: under (7).
+    """
+    Lambda = inverse(Sigma_bar) + A
+    if tip is not None:
+        step, Sigma = tip.solve(Lambda, g)
+        return step, Sigma, square(Lambda, step)
+    eye = torch.eye(A.shape[-1], dtype=A.dtype).expand_as(A)
+    both = solve_spd(Lambda, torch.cat([g.unsqueeze(-1), eye], -1))
+    step, Sigma = both[..., 0], both[..., 1:]
+    return step, 0.5 * (Sigma + Sigma.mT), (g * step).sum(-1)
 
 
-def limited(step: Float[Tensor, "B n"], limit: float) -> Float[Tensor, "B n"]:
+def limited(step: Float[Tensor, "B n"], limit: float | Float[Tensor, "B 1"]) -> Float[Tensor, "B n"]:
     """The step, shortened so that no entry changes by more than the limit; zero where the update failed."""
     step = step.nan_to_num(0.0, 0.0, 0.0)
     return step * (limit / step.abs().amax(-1, keepdim=True).clamp(min=1e-300)).clamp(max=1.0)
 
 
-def posterior(A: Float[Tensor, "B n n"]) -> Float[Tensor, "B n n"]:
-    """(H^T W H + P)^-1 with the true noise: the covariance of the estimate."""
-    return solve_spd(A, torch.eye(A.shape[-1], dtype=A.dtype).expand_as(A))
+def reached(
+    step: Float[Tensor, "B n"], last: Float[Tensor, "B n"], reach: Float[Tensor, " B"], limit: float
+) -> Float[Tensor, " B"]:
+    """The share of the step limit that the next step may use, from what the one before could.
+
+    Half of it where the largest entry turns back, else up to a fifth more. Along a direction in which the cost is far from a
+    parabola, such as the logarithm of a width, steps would otherwise swing to and fro for ever. Source: Rprop, Riedmiller & Braun
+    1993.
+    """
+    size, at = step.nan_to_num(0.0, 0.0, 0.0).abs().max(-1, keepdim=True)
+    came = (last.gather(-1, at) * step.gather(-1, at).sign()).squeeze(-1)
+    back = -came > TURN * torch.minimum(size.squeeze(-1), limit * reach)
+    return torch.where(back, 0.5 * reach, (1.2 * reach).clamp(max=1.0))
+
+
+@dataclass(frozen=True)
+class TipCondition:
+    """c(x + dx) = 0 to first order, solved for the base wrench alpha, which are the last BASE entries of x = [y, alpha]:
+
+    (7)  dalpha = d - T dy,    d = -C_alpha^-1 c,    T = C_alpha^-1 C_y,    C = dc/dx
+
+    T (B, 6, m), d (B, 6). C_alpha is singular where the rod is about to buckle; the solution is NaN there.
+    """
+
+    T: Float[Tensor, "B 6 m"]
+    d: Float[Tensor, "B 6"]
+
+    @classmethod
+    def of(cls, C: Float[Tensor, "B 6 n"], r: Float[Tensor, "B 6"]) -> "TipCondition":
+        """From C = dc/dx and r = -c."""
+        both, info = torch.linalg.solve_ex(C[..., -BASE:], torch.cat([C[..., :-BASE], r.unsqueeze(-1)], -1))
+        both = torch.where((info == 0)[:, None, None], both, torch.nan)
+        return cls(both[..., :-1], both[..., -1])
+
+    def reduced(self, A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B m m"], Float[Tensor, "B m"]]:
+        """Information and gradient of y alone, from those of [y, alpha]:
+
+        (8)  Z^T A Z and Z^T (g - A [0, d]),    Z = [1, -T]
+        """
+        pulled = A[:, -BASE:, -BASE:] @ self.T - A[:, -BASE:, :-BASE]
+        A_y = A[:, :-BASE, :-BASE] + self.T.mT @ pulled - A[:, :-BASE, -BASE:] @ self.T
+        g_y = g[:, :-BASE] - (self.T.mT @ g[:, -BASE:].unsqueeze(-1)).squeeze(-1) + (pulled.mT @ self.d.unsqueeze(-1)).squeeze(-1)
+        return A_y, g_y
+
+    def along(self, dy: Float[Tensor, "B m k"]) -> Float[Tensor, "B n k"]:
+        """Z dy: how x moves with y, c unchanged."""
+        return torch.cat([dy, -self.T @ dy], -2)
+
+    def solve(self, A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n"], Float[Tensor, "B n n"]]:
+        """The step dx that minimizes dx^T A dx / 2 - g^T dx under (7), and Z (Z^T A Z)^-1 Z^T, the covariance."""
+        A_y, g_y = self.reduced(A, g)
+        eye = torch.eye(A_y.shape[-1], dtype=A.dtype).expand_as(A_y)
+        both = solve_spd(A_y, torch.cat([g_y.unsqueeze(-1), eye], -1))
+        step = self.along(both[..., :1]).squeeze(-1)
+        C = self.along(self.along(both[..., 1:]).mT)
+        return torch.cat([step[:, :-BASE], step[:, -BASE:] + self.d], -1), 0.5 * (C + C.mT)
+
+
+def square(A: Float[Tensor, "B n n"], dx: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
+    """dx^T A dx."""
+    return (dx * (A @ dx.unsqueeze(-1)).squeeze(-1)).sum(-1)
 
 
 def decrement(A: Float[Tensor, "B n n"], g: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
@@ -100,6 +173,7 @@ class Limits(NamedTuple):
     creeps along a direction in which the cost has no minimum (the paper's width c).
     settled: the cost with adapted weights is at its minimum when a step promises less than this. The step that shows that the
     filter has arrived is taken nevertheless: it is there already, and leaves of the promised decrement next to nothing.
+    exact: steps keep (7). What they promise is then dx^T A dx, the change of what is read, which counts the way back to c = 0, too.
     """
 
     step: float = 0.6
@@ -107,19 +181,22 @@ class Limits(NamedTuple):
     share: float = 1e-6
     settled: float = 1.0
     gain: float = 0.0
+    exact: bool = False
 
 
 @dataclass(frozen=True)
 class Normal:
     """Normal equations of B samples, markers and tip residual apart, because only the markers' noise is adapted.
 
-    A (B, 2, n, n) = H^T W H, g (B, 2, n) = H^T W r, cost (B, 2) = r^T W r; seen (B,): marker coordinates that were seen.
+    A (B, 2, n, n) = H^T W H, g (B, 2, n) = H^T W r, cost (B, 2) = r^T W r; seen (B,): marker coordinates that were seen; tip: the
+    condition that the tip residual is zero, to first order, where there is one.
     """
 
     A: Float[Tensor, "B 2 n n"]
     g: Float[Tensor, "B 2 n"]
     cost: Float[Tensor, "B 2"]
     seen: Int[Tensor, " B"]
+    tip: TipCondition | None = None
 
     def whole(
         self, x: Float[Tensor, "B n"], mean: Float[Tensor, "*B n"], precision: Float[Tensor, "*B n"], share: Tensor | float = 1.0
@@ -130,10 +207,27 @@ class Normal:
         A = w * self.A[:, 0] + self.A[:, 1] + torch.diag_embed(precision)
         return A, share * self.g[:, 0] + self.g[:, 1] + precision * off, self.cost.sum(-1) + (precision * off**2).sum(-1)
 
-    def exact(self, factor: float) -> "Normal":
-        """With a tip residual that many times stiffer."""
-        scale = self.cost.new_tensor([1.0, factor**2])
-        return Normal(self.A * scale[:, None, None], self.g * scale[:, None], self.cost * scale, self.seen)
+    @property
+    def readings(self) -> "Normal":
+        """Without the tip residual."""
+        scale = self.cost.new_tensor([1.0, 0.0])
+        return Normal(self.A * scale[:, None, None], self.g * scale[:, None], self.cost * scale, self.seen, self.tip)
+
+    def posterior(
+        self, x: Float[Tensor, "B n"], mean: Float[Tensor, "*B n"], precision: Float[Tensor, "*B n"], exact: bool
+    ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
+        """Covariance of the estimate, with the true noise and c = 0, and the cost with the prior.
+
+        exact: the cost where the step under (7) leads, to second order; at x the tip may still be a little out of balance, which
+        can look cheaper than any equilibrium. Otherwise the cost at x, that of c included.
+        """
+        assert self.tip is not None
+        A, g, cost = self.readings.whole(x, mean, precision)
+        finite = torch.isfinite(self.A).flatten(1).all(-1)
+        step, C = self.tip.solve(A, g)
+        onward = cost - 2 * (g * step).sum(-1) + square(A, step)
+        C = torch.where(finite[:, None, None], C, torch.nan)
+        return C, torch.where(torch.isfinite(onward), onward, cost) if exact else cost + self.cost[:, 1]
 
 
 def student(
@@ -175,28 +269,40 @@ def normal_equations(
     parts = [(H[:, :m], r[:, :m], w[:, :m]), (H[:, m:], r[:, m:], w[:, m:])]
     A = torch.stack([H.mT @ (w.unsqueeze(-1) * H) for H, _, w in parts], 1)
     g = torch.stack([((w * r).unsqueeze(-1) * H).sum(-2) for H, r, w in parts], 1)
-    return Normal(A, g, torch.stack([cost, (w * r * r)[:, m:].sum(-1)], -1), seen)
+    tip = TipCondition.of(H[:, m:], r[:, m:]) if H.shape[1] - m == BASE else None
+    return Normal(A, g, torch.stack([cost, (w * r * r)[:, m:].sum(-1)], -1), seen, tip)
+
+
+STATE = ("x", "Sigma", "before", "cap", "reach", "done")
 
 
 @dataclass(frozen=True)
 class Iterate:
     """Where the filter stands: x, the covariance Sigma of (1), the last x at which the model was sound, and the cap on the
-    inflation of the noise, which falls each time that the adapted problem has settled. done: whether x has arrived.
+    inflation of the noise, which falls each time that the adapted problem has settled. reach: the share of the step limit that a
+    step may use (`reached`). done: whether x has arrived.
     """
 
     x: Float[Tensor, "B n"]
     Sigma: Float[Tensor, "B n n"]
     before: Float[Tensor, "B n"]
     cap: Float[Tensor, " B"]
+    reach: Float[Tensor, " B"]
     done: Bool[Tensor, " B"]
+
+    @classmethod
+    def start(cls, x: Float[Tensor, "B n"], Sigma: Float[Tensor, "B n n"], cap: float) -> "Iterate":
+        """Before the first iteration, in memory of its own."""
+        none = torch.zeros(len(x), dtype=torch.bool)
+        return cls(x.clone(), Sigma.clone(), x.clone(), x.new_full((len(x),), cap), x.new_ones(len(x)), none)
 
     def take(self, index: Int[Tensor, " b"]) -> "Iterate":
         """The samples of an index."""
-        return Iterate(self.x[index], self.Sigma[index], self.before[index], self.cap[index], self.done[index])
+        return Iterate(*(getattr(self, name)[index] for name in STATE))
 
     def put(self, index: Int[Tensor, " b"], other: "Iterate") -> None:
         """Write the samples of an index, in place."""
-        for name in ("x", "Sigma", "before", "cap", "done"):
+        for name in STATE:
             getattr(self, name)[index] = getattr(other, name)
 
 
@@ -209,24 +315,28 @@ def advance(
     limits: Limits,
 ) -> Iterate:
     """One iteration: (1)-(5) with residual-adaptive noise. Its compiled copy is torchrod/kernel/filter.h."""
-    A, g, cost = N.whole(at.x, *prior)
-    promised = decrement(A, g)
-    sound = torch.isfinite(cost) & torch.isfinite(A).flatten(1).all(-1)
+    tip = N.tip if limits.exact else None
+    counted = N if tip is None else N.readings
+    A, g, cost = counted.whole(at.x, *prior)
+    promised = decrement(A, g) if tip is None else square(A, tip.solve(A, g)[0])
+    sound = torch.isfinite(cost) & torch.isfinite(N.A).flatten(1).all(-1)
     done = (promised < (limits.share * cost).clamp(min=limits.decrement)) & sound
     inflated = torch.minimum(promised.nan_to_num(0.0) / N.seen.clamp(min=1), at.cap)
-    A, g, _ = N.whole(at.x, *prior, share=1 / (1 + inflated).unsqueeze(-1))
-    step, Sigma = update(predict(at.Sigma, Q), A, g)
-    gain = (g * step).sum(-1)
+    A, g, _ = counted.whole(at.x, *prior, share=1 / (1 + inflated).unsqueeze(-1))
+    step, Sigma, gain = update(predict(at.Sigma, Q), A, g, tip)
     done = done | ((gain < limits.gain) & sound)
     # Where the adapted problem has settled but the true one has not, the weights must move on towards the true ones.
     cap = torch.where(gain < limits.settled, 0.1 * inflated, at.cap)
     fresh = torch.isfinite(Sigma).flatten(1).all(-1) & sound
+    reach = reached(step, at.x - at.before, at.reach, limits.step)
+    most = limits.step * reach.unsqueeze(-1)
     # A model that overflowed says nothing: go half way back to the last place where it did.
-    onward = torch.where(sound.unsqueeze(-1), at.x + limited(step, limits.step), 0.5 * (at.x + at.before))
+    onward = torch.where(sound.unsqueeze(-1), at.x + limited(step, most), 0.5 * (at.x + at.before))
     return Iterate(
         onward,
         torch.where(fresh[:, None, None], Sigma, Sigma0),
         torch.where(sound.unsqueeze(-1), at.x, at.before),
         cap,
+        reach,
         done,
     )

@@ -93,7 +93,7 @@ class Estimate:
 
     x, covariance: the state in the units of Problem.state and its posterior (H^T W H + P)^-1 with the true noise; covariances are
     NaN where the fit has not converged. As in any Kalman filter x is one update further than the evaluation of the model that the
-    covariance, the residual, the centre line, cost and chi2 are of: by less than what 1e-3 of chi^2 can tell.
+    covariance, the residual and the centre line are of, by less than what 1e-3 of chi^2 can tell; cost and chi2 are foretold for x.
     force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
     net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
     tip (B, 6) [N, N m] and tip_covariance (B, 6, 6): the unknown dead wrench at the tip, base frame, zero in the entries that are

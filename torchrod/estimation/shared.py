@@ -89,11 +89,15 @@ def _frame_eliminated(problem: Problem, unknowns: Unknowns, x: Float[Tensor, "b 
     block = wide.state.registration
     at = torch.arange(block.at.start, block.at.stop)
     full = torch.cat([x[:, : block.at.start], x.new_zeros(len(x), block.size), x[:, block.at.start :]], -1)
-    here = linearize(wide, full, wide.exact_weights)
+    here = linearize(wide, full, exact=True)
+    assert here.tip is not None
     unit = torch.ones(wide.size, dtype=DTYPE).index_copy(0, at, block.unit.reciprocal())
     held = torch.zeros(wide.size, dtype=DTYPE).index_copy(0, at, block.precision)  # (2) has the prior once for all samples
-    A = (here.A - torch.diag(held)) * unit * unit.unsqueeze(-1)
-    return eliminated(A, here.g * unit, at)
+    A, g = here.tip.reduced(here.A - torch.diag(held), here.g)
+    found = eliminated(A * unit[: -ekf.BASE] * unit[: -ekf.BASE].unsqueeze(-1), g * unit[: -ekf.BASE], at)
+    own = torch.ones(A.shape[-1], dtype=torch.bool).index_fill(0, at, False)
+    follows = here.tip.T[..., at] * unit[at] - here.tip.T[..., own] @ found.G
+    return replace(found, G=torch.cat([found.G, follows], 1))
 
 
 def _prior(problem: Problem) -> Float[Tensor, "6 6"]:

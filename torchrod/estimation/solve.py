@@ -1,8 +1,8 @@
 """Estimate: iterate the filter on a batch until every sample has settled, and what wraps it where one run is not enough.
 
 A solver maps a problem and a start to an estimate. `Filter` is the plain one: init, step, terminate. The strategies each wrap one:
-`Robust` goes on with Student's t, `Restarts` tries other magnitudes where a fit is not accepted, `Challenged` drops a start that is
-no nearer to the data than a cold one, and follows one that fails by a cold start.
+`Robust` goes on with Student's t, `Basins` looks elsewhere where a fit is plainly wrong, `Restarts` tries other magnitudes where it
+is not accepted, `Challenged` drops a start that is no nearer to the data than a cold one and follows one that fails by a cold one.
 """
 
 import math
@@ -23,7 +23,7 @@ from ..util.status import Status
 from ..util.threads import one_thread
 from . import filter as ekf
 from .evaluator import Evaluator, Run, evaluator, kernel_serves
-from .result import Estimate, make_estimate
+from .result import Estimate, limit, make_estimate
 from .starts import Fate, Origin, Start, StartRule, challenged_by_cold, cold_start, in_equilibrium
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
@@ -33,6 +33,8 @@ NEAR = 10.0  # near: the next step promises to lower the cost by less than this
 PAPER_GAIN = 1e-3  # of chi^2: what the paper calls converged is not printed
 PAPER_SIZES, PAPER_ALPHA = (50.0, 50.0, 0.03, 10.0), (3.0, 0.07)  # of [a_x, a_y (N/m), eta, c (1/m^2)] and of [N, N m]
 PAPER_RATIO = 2.0  # square root of Sigma_0 over Q
+BASINS = 3  # starts elsewhere that are tried; the best is nearly always the first
+WRONG = 10.0  # times the 99.9 % point of chi^2: more than noise that is stated too small, or a model that is slightly off
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 Progress = Callable[[int], object]
 
@@ -49,6 +51,9 @@ class Settings:
     coarse: begin with model.problem.COARSE_STEPS steps along the rod and end, where the fit is near, with the problem's own.
     robust: degrees of freedom of Student's t, by which the fit goes on from where the normal distribution's has ended; markers far
     off then weigh little (estimation.filter (6)), and those beyond the 99.9 % point are called outliers. inf: the normal one alone.
+    basins: a sample whose fit has not converged, or leaves WRONG times what is accepted, is tried again from so many others of the
+    load family's starts (`LoadFamily.elsewhere`), those of least cost: the shape of a rod that a strong push has wrapped around is
+    one of several with the same residual at first.
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
@@ -64,6 +69,7 @@ class Settings:
     coarse: bool = True
     max_iterations: int = 100
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
+    basins: int = BASINS
     robust: float = math.inf
     gain: float = 0.0
 
@@ -108,33 +114,42 @@ def paper_settings(problem: Problem, Q: float = 1.0, Sigma0: float = 1.0) -> Set
         coarse=False,
         max_iterations=500,
         restarts=(),
+        basins=0,
         gain=PAPER_GAIN,
     )
 
 
 @dataclass(frozen=True)
 class Linearized:
-    """One evaluation of the model at x: residual, Jacobian, information of data and prior, cost, decrement."""
+    """One evaluation of the model at x: residual r, Jacobian H, information A, gradient g and cost of the readings and the prior.
+
+    tip: the tip condition to first order; None where the tip residual is weighed instead and counts in A, g and cost.
+    """
 
     r: Float[Tensor, "B z"]
     H: Float[Tensor, "B z n"]
     A: Float[Tensor, "B n n"]
     g: Float[Tensor, "B n"]
     cost: Float[Tensor, " B"]
-    decrement: Float[Tensor, " B"]
+    tip: ekf.TipCondition | None
+
+    @property
+    def decrement(self) -> Float[Tensor, " B"]:
+        """What a full Gauss-Newton step promises: see estimation.filter.Limits."""
+        return ekf.decrement(self.A, self.g) if self.tip is None else ekf.square(self.A, self.tip.solve(self.A, self.g)[0])
 
 
-def linearize(problem: Problem, x: Float[Tensor, "B n"], w: Float[Tensor, "B z"] | None = None) -> Linearized:
+def linearize(problem: Problem, x: Float[Tensor, "B n"], exact: bool | None = None) -> Linearized:
     """r = z - h(x) (zero where nothing was read), H = dh/dx, and the cost r^T W r + (x0 - x)^T P (x0 - x) of (3).
 
-    w: other weights than the problem's.
+    exact: whether the tip residual is a condition instead of rows with a weight; None: as at the problem's answer.
     """
-    w = problem.weights if w is None else w
     h, H = problem.linearized(x)
-    r = torch.where(w > 0, problem.reading - h, 0.0)
-    A, g = ekf.information(H, r, w, x, problem.mean, problem.precision)
-    cost = (w * r * r).sum(-1) + (problem.precision * (problem.mean - x) ** 2).sum(-1)
-    return Linearized(r, H, A, g, cost, ekf.decrement(A, g))
+    r = torch.where(problem.weights > 0, problem.reading - h, 0.0)
+    N = ekf.normal_equations(H, r, problem.weights, problem.groups)
+    exact = problem.exact_tip if exact is None else exact
+    A, g, cost = (N.readings if exact else N).whole(x, problem.mean, problem.precision)
+    return Linearized(r, H, A, g, cost, N.tip if exact else None)
 
 
 @runtime_checkable
@@ -148,20 +163,21 @@ class Solver(Protocol):
 
 @dataclass(frozen=True)
 class Filter:
-    """The recursion (4) on a batch: samples far from the data by a coarse model of the rod, the rest by the problem's own."""
+    """The recursion (4) on a batch: samples far from the data by a coarse model whose tip may be out of balance, the rest
+    by the problem's own, in equilibrium.
+    """
 
     settings: Settings
     nu: float = math.inf
 
     def init(self, problem: Problem, start: Start) -> Run:
         """The state before the first iteration."""
-        settings, x = self.settings, start.x.clone()
+        settings, x = self.settings, start.x
         Sigma0 = settings.initial_covariance(x).expand(len(x), -1, -1) if start.Sigma0 is None else start.Sigma0
         Sigma0, Q = Sigma0.contiguous(), settings.Q * x.new_ones(problem.size)
-        cap = x.new_full((len(x),), torch.inf if settings.adaptive else 0.0)
-        at = ekf.Iterate(x, Sigma0.clone(), x.clone(), cap, torch.zeros(len(x), dtype=torch.bool))
+        at = ekf.Iterate.start(x, Sigma0, torch.inf if settings.adaptive else 0.0)
         sums = kernel.Sums.room(len(x), problem.size, problem.weights.shape[-1], len(problem.s))
-        near = torch.full((len(x),), not settings.coarse or problem.coarse is problem)
+        near = torch.full((len(x),), not problem.exact_tip and (not settings.coarse or problem.coarse is problem))
         return Run(at, Sigma0, Q, sums, near)
 
     def step(
@@ -173,7 +189,7 @@ class Filter:
         """
         rough, fine = models
         limits = ekf.Limits(step=self.settings.step_limit, gain=self.settings.gain)
-        both = limits._replace(decrement=NEAR), limits
+        both = limits._replace(decrement=NEAR), limits._replace(exact=models[1].problem.exact_tip)
         most = self.settings.max_iterations
         at_once = rough.iterate_all(fine, run, both, live, most)
         if at_once is not None:
@@ -199,7 +215,7 @@ class Filter:
     def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
         """See Solver."""
         fine = evaluator(problem, self.nu)
-        rough = fine if problem.coarse is problem else evaluator(problem.coarse, self.nu)
+        rough = evaluator(problem.coarse, self.nu) if self.settings.coarse and problem.coarse is not problem else fine
         run = self.init(problem, start)
         ok = problem.usable
         status = torch.where(ok, int(Status.NOT_CONVERGED), int(Status.INVALID))
@@ -241,19 +257,59 @@ class Robust:
 
 
 @dataclass(frozen=True)
-class Restarts:
-    """The solver's fit, and where it is not accepted a hasty one's from its loads times each of the factors."""
+class Basins:
+    """The solver's fit; where that is plainly wrong a hasty one's from the starts elsewhere that cost least, `most` of them."""
 
     solver: Solver
     hasty: Callable[[], Solver]
-    factors: tuple[float, ...]
+    most: int
 
     def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
         """See Solver."""
         return self.improve(problem, self.solver(problem, start, progress))
 
     def improve(self, problem: Problem, fit: Estimate, wanted: Bool[Tensor, " B"] | bool = True) -> Estimate:
-        """A fit that is there already, restarted where it is not accepted and a restart wanted."""
+        """A fit that is there already, looked for elsewhere where it is plainly wrong and that is wanted."""
+        elsewhere = getattr(problem.unknowns.loads, "elsewhere", None)  # a family of a user's own need not have it
+        if not self.most or elsewhere is None or not len(gammas := elsewhere()):
+            return fit
+        limits = torch.tensor([WRONG * limit(dof) for dof in fit.dof.tolist()], dtype=DTYPE)
+        wrong = problem.usable & wanted & ~((fit.status == int(Status.CONVERGED)) & (fit.chi2 < limits))
+        index = wrong.nonzero().squeeze(-1)
+        if not len(index):
+            return fit
+        begin = torch.stack([self._cheapest(problem.take(i), gammas) for i in index.split(1)], 1)
+        for x in begin:
+            left = ~fit.accepted[index]
+            if not bool(left.any()):
+                break
+            part = problem.take(index[left])
+            fit = fit.improved_by(self.hasty()(part, Start.at(x[left], Origin.ELSEWHERE)), index[left])
+        return fit
+
+    def _cheapest(self, one: Problem, gammas: Float[Tensor, "C g"]) -> Float[Tensor, "most n"]:
+        """The states of least cost of a problem of one sample."""
+        many = one.take(torch.zeros(len(gammas), dtype=torch.int64))
+        x = in_equilibrium(many, gammas)
+        cost = evaluator(many.coarse).cost(x).nan_to_num(torch.inf)
+        return x[cost.argsort()[: self.most]]
+
+
+@dataclass(frozen=True)
+class Restarts:
+    """The solver's fit, and where it is not accepted a hasty one's from its loads times each of the factors."""
+
+    solver: Basins
+    hasty: Callable[[], Solver]
+    factors: tuple[float, ...]
+
+    def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
+        """See Solver."""
+        return self.improve(problem, self.solver.solver(problem, start, progress))
+
+    def improve(self, problem: Problem, fit: Estimate, wanted: Bool[Tensor, " B"] | bool = True) -> Estimate:
+        """A fit that is there already, looked for elsewhere and restarted where it is not accepted and that is wanted."""
+        fit = self.solver.improve(problem, fit, wanted)
         loads, at = problem.unknowns.loads, problem.state.loads.at
         for factor in self.factors if loads.size else ():
             index = (~fit.accepted & torch.isfinite(fit.x).all(-1) & wanted).nonzero().squeeze(-1)
@@ -275,7 +331,7 @@ class Challenged:
     def __call__(self, problem: Problem, start: Start, progress: Progress = silent) -> Estimate:
         """See Solver."""
         chosen, dropped = challenged_by_cold(problem, start, self.settings.initial_covariance(start.x))
-        fit = self.solver.solver(problem, chosen, progress)
+        fit = self.solver.solver.solver(problem, chosen, progress)
         failed = chosen.challenged & ~fit.accepted & problem.usable
         fate = torch.zeros_like(start.origin)
         fate[dropped], fate[failed] = int(Fate.DROPPED), int(Fate.RETRIED)
@@ -297,7 +353,7 @@ def solver_of(settings: Settings) -> Solver:
     def hasty() -> Solver:
         return base(replace(settings, max_iterations=min(settings.max_iterations, RESTART_ITERATIONS)))
 
-    return Challenged(Restarts(base(settings), hasty, settings.restarts), settings)
+    return Challenged(Restarts(Basins(base(settings), hasty, settings.basins), hasty, settings.restarts), settings)
 
 
 def estimate_each(

@@ -22,6 +22,7 @@ class Origin(IntEnum):
     PREVIOUS = 2
     SCORE_TEST = 3
     OTHER_FIT = 4
+    ELSEWHERE = 5
 
     @property
     def label(self) -> str:
@@ -35,6 +36,7 @@ _LABELS = {
     Origin.PREVIOUS: "start from the previous frame",
     Origin.SCORE_TEST: "start from the score test",
     Origin.OTHER_FIT: "start from another fit",
+    Origin.ELSEWHERE: "start elsewhere",
 }
 
 

@@ -83,14 +83,15 @@ class CFilter(ctypes.Structure):
         *((n, CTable) for n in ("mean", "precision")),
         ("Q", _P),
         *((n, _D) for n in ("step", "decrement", "share", "settled", "gain")),
-        *((n, _P) for n in ("x", "Sigma", "before", "cap", "Sigma0", "done")),
+        ("exact", _I),
+        *((n, _P) for n in ("x", "Sigma", "before", "cap", "reach", "Sigma0", "done")),
     ]
 
 
 class CSums(ctypes.Structure):
     """Where the normal equations are written."""
 
-    _fields_ = [(n, _P) for n in ("A", "g", "cost", "r", "line")]
+    _fields_ = [(n, _P) for n in ("A", "g", "cost", "C", "r", "line")]
 
 
 class CCourse(ctypes.Structure):
@@ -124,7 +125,7 @@ CONSTANTS = {"MOST_TENDONS": MOST_TENDONS, "OUT": OUT} | FAMILIES
 FUNCTIONS: dict[str, tuple[type, ...]] = {
     "torchrod_march": (_P, _I),
     "torchrod_normal": (_P, _P, _I, _P, _I),
-    "torchrod_posterior": (_P, _P, _P, _P, _I, _D, _I, _P, _P, _I),
+    "torchrod_posterior": (_P, _P, _P, _P, _I, _I, _I, _I, _P, _P, _I),
     "torchrod_iterate": (_P, _P, _P, _P, _I, _I),
     "torchrod_filter": (_P, _P, _I, _I),
     "torchrod_balance": (_P, _P, _P, _I, _I, _D, _P, _P, _P, _I),
@@ -332,23 +333,24 @@ class FitTables:
 
 @dataclass(frozen=True)
 class Sums:
-    """The normal equations of samples, markers and tip residual apart, with the residuals and the centre line (m)."""
+    """The normal equations of samples, markers and tip residual apart, dc/dx, the residuals and the centre line (m)."""
 
     A: Float[Tensor, "B 2 n n"]
     g: Float[Tensor, "B 2 n"]
     cost: Float[Tensor, "B 2"]
+    C: Float[Tensor, "B 6 n"]
     r: Float[Tensor, "B z"]
     line: Float[Tensor, "B P 3"]
 
     @classmethod
     def room(cls, B: int, n: int, z: int, P: int) -> "Sums":
         """To be written, for n unknowns, z rows and P places."""
-        sizes = ((B, 2, n, n), (B, 2, n), (B, 2), (B, z), (B, P, 3))
+        sizes = ((B, 2, n, n), (B, 2, n), (B, 2), (B, 6, n), (B, z), (B, P, 3))
         return cls(*(torch.empty(size, dtype=torch.float64) for size in sizes))
 
     def put(self, index: Int[Tensor, " b"], other: "Sums") -> None:
         """Write the samples of an index, in place."""
-        for name in ("A", "g", "cost", "r", "line"):
+        for name in ("A", "g", "cost", "C", "r", "line"):
             getattr(self, name)[index] = getattr(other, name)
 
     @property
@@ -369,12 +371,12 @@ def _prior(mean: Prior, precision: Prior) -> tuple[Tensor, Tensor, CTable, CTabl
     return mean, precision, _table(mean, "mean"), _table(precision, "precision")
 
 
-def normal_equations_now(x: Float[Tensor, "B n"], task: CTask, P: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """H^T W H (B, 2, n, n), H^T W r (B, 2, n) and r^T W r (B, 2) of the markers and of the tip residual; r (B, z); centre line."""
+def normal_equations_now(x: Float[Tensor, "B n"], task: CTask, P: int) -> Sums:
+    """The sums at x."""
     (B, n), x = x.shape, x.contiguous()
     found = Sums.room(B, n, 3 * P + 6, P)
     _run("torchrod_normal", B, ctypes.byref(task), _pointer(x, "x"), B, ctypes.byref(found.structure))
-    return found.A, found.g, found.cost, found.r, found.line
+    return found
 
 
 def cost_now(x: Float[Tensor, "B n"], mean: Prior, precision: Prior, task: CTask) -> Float[Tensor, " B"]:
@@ -386,12 +388,12 @@ def cost_now(x: Float[Tensor, "B n"], mean: Prior, precision: Prior, task: CTask
 
 
 def posterior_now(
-    sums: Sums, x: Float[Tensor, "B n"], mean: Prior, precision: Prior, stiffer: float
+    sums: Sums, x: Float[Tensor, "B n"], mean: Prior, precision: Prior, exact: bool
 ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
-    """From the sums at x: the covariance, with the tip residual's weight multiplied by `stiffer`, and the cost with the prior's."""
+    """From the sums at x: estimation.filter.Normal.posterior, the covariance and the cost."""
     (B, n), x, (*_held, m, p) = x.shape, x.contiguous(), _prior(mean, precision)
     covariance, cost = x.new_empty(B, n, n), x.new_empty(B)
-    given = (ctypes.byref(sums.structure), _pointer(x, "x"), ctypes.byref(m), ctypes.byref(p), n, stiffer, B)
+    given = (ctypes.byref(sums.structure), _pointer(x, "x"), ctypes.byref(m), ctypes.byref(p), n, sums.r.shape[-1], int(exact), B)
     _run("torchrod_posterior", B, *given, _pointer(covariance, "covariance"), _pointer(cost, "cost"))
     return covariance, cost
 
@@ -414,7 +416,7 @@ def balance_now(
 class Iteration:
     """Iterations of the filter on one chunk, in place: estimation.filter.advance at the normal equations of x.
 
-    state: x, Sigma, before, cap, done of estimation.filter.Iterate. filtering: Sigma0 (B, n, n), Q (n), mean and precision of the
+    state: the fields of estimation.filter.Iterate. filtering: Sigma0 (B, n, n), Q (n), mean and precision of the
     prior, (n) or (B, n). limits: those of estimation.filter.Limits by name. sums: written for the samples that are done.
     """
 

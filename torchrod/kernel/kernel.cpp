@@ -74,25 +74,33 @@ void torchrod_normal(const Task* f, const double* x, int64_t count, const Sums* 
     });
 }
 
-// From sums at x (b, n): the cost (b) with the prior's, and the covariance (b, n, n) with a tip residual whose weight is multiplied by
-// `stiffer`; NaN where there is none. mean and precision: of the prior, (n) or a row per sample.
-void torchrod_posterior(const Sums* sums, const double* x, const Table* mean, const Table* precision, int64_t n, double stiffer,
+// From sums at x (b, n), with residuals of `rows` numbers: `Normal.posterior` of estimation/filter.py, covariance (b, n, n) and cost (b).
+// mean and precision: of the prior, (n) or a row per sample.
+void torchrod_posterior(const Sums* sums, const double* x, const Table* mean, const Table* precision, int64_t n, int64_t rows, int64_t exact,
                         int64_t count, double* covariance, double* cost, int64_t threads) {
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room&, std::vector<V>& numbers) {
-        numbers.resize(3 * n * n + n);
-        V *A = numbers.data(), *found = A + n * n, total = fetch({sums->cost, 2}, lanes, 0) + fetch({sums->cost, 2}, lanes, 1);
+        numbers.resize(4 * n * n + 5 * n + TipCondition::size(n));
+        V *A = numbers.data(), *found = A + n * n, *reduced = found + n * n, *factor = reduced + n * n;
+        V *g = factor + n * n + n, *g_y = g + n, *middle = g_y + n, *step = middle + n, *room = step + n;
+        V total = fetch({sums->cost, 2}, lanes, 0);
         Mask sound = finite(V{});
         for (int64_t i = 0; i < n; i++) {
             const V P = fetch(*precision, lanes, i), off = fetch(*mean, lanes, i) - fetch({x, n}, lanes, i);
             total += P * off * off;
+            g[i] = fetch({sums->g, 2 * n}, lanes, i) + P * off;
             for (int64_t j = 0; j <= i; j++) {
-                const V markers = fetch({sums->A, 2 * n * n}, lanes, i * n + j);
-                const V tip = fetch({sums->A, 2 * n * n}, lanes, n * n + i * n + j);
-                A[i * n + j] = markers + stiffer * tip + (i == j ? P : V{});
-                sound &= finite(A[i * n + j]);
+                A[i * n + j] = fetch({sums->A, 2 * n * n}, lanes, i * n + j) + (i == j ? P : V{});
+                sound &= finite(A[i * n + j]) & finite(fetch({sums->A, 2 * n * n}, lanes, n * n + i * n + j));
             }
         }
-        Inverse(n, A, found + n * n).whole(found);
+        const auto condition = [&](int64_t k, int64_t j) {
+            return j < n ? fetch({sums->C, PLAIN * n}, lanes, k * n + j) : fetch({sums->r, rows}, lanes, rows - PLAIN + k);
+        };
+        const TipCondition tip(n, condition, room);
+        V onward = total + tip.solve(A, g, reduced, g_y, factor, middle, step, [&](const Inverse& inverse) { tip.spread(inverse, reduced, found); });
+        for (int64_t i = 0; i < n; i++) onward -= 2.0 * g[i] * step[i];
+        if (exact) total = select(finite(onward), onward, total);
+        else total += fetch({sums->cost, 2}, lanes, 1);
         for (int64_t l = 0; l < lanes.count; l++) {
             const int64_t b = lanes.sample[l];
             cost[b] = total[l];

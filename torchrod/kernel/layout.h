@@ -44,9 +44,9 @@ inline std::string structures_and_constants() {
         F(node) END
     BEGIN(Task) F(known), F(loads), F(size), F(tip), F(tensions), F(registration), F(force_unit), F(moment_unit), F(length_unit),
         F(angle_unit), F(tension_unit), F(robust), F(offsets), F(active), F(weight), F(positions), F(w) END
-    BEGIN(Filter) F(mean), F(precision), F(Q), F(step), F(decrement), F(share), F(settled), F(gain), F(x), F(Sigma), F(before), F(cap), F(Sigma0),
+    BEGIN(Filter) F(mean), F(precision), F(Q), F(step), F(decrement), F(share), F(settled), F(gain), F(exact), F(x), F(Sigma), F(before), F(cap), F(reach), F(Sigma0),
         F(done) END
-    BEGIN(Sums) F(A), F(g), F(cost), F(r), F(line) END
+    BEGIN(Sums) F(A), F(g), F(cost), F(C), F(r), F(line) END
     BEGIN(Course) F(coarse), F(fine), F(rough), F(filter), F(out), F(most), F(near), F(converged), F(iterations) END
     BEGIN(March) F(known), F(batch), F(tangents), F(load_tangents), F(reverse), F(y0), F(dy0), F(local), F(dlocal), F(out), F(dout) END
     BEGIN(Perceptron) F(depth), F(sizes), F(weights) END

@@ -67,7 +67,7 @@ struct Room {
 
 struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the centre line in the rod's own frame
     V *rows, *line;
-    int64_t width;
+    int64_t width, tip;  // the first row of c
     V& h(int64_t z) const { return rows[z * width]; }
     V* H(int64_t z) const { return rows + z * width + 1; }
 };
@@ -174,7 +174,7 @@ template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool
     const int64_t width = slopes ? 1 + n : 1;
     room.rows.assign((3 * P + PLAIN) * width, V{});
     room.line.assign(3 * P, V{});
-    const Measured to{room.rows.data(), room.line.data(), width};
+    const Measured to{room.rows.data(), room.line.data(), width, 3 * P};
     const Group g = group_of(f, lanes, x, slopes, room);
     Motion motion;
     if (f.registration) {

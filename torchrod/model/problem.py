@@ -32,7 +32,6 @@ COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: withi
 TIP_ROWS = 6
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
-TIP_EXACT = 10.0  # the covariance of the result takes the tip residual as this much stiffer
 _states = Kept(256)
 _OF_READINGS = (
     "state",
@@ -61,8 +60,8 @@ class Problem(Float64):
     its noise; their rows stand one after the other in h. tension: (B, T) N for a tendon robot, the readings of its load cells.
     steps: the least number of arc-length steps; 0: as many as the reference shape asks for. prior: mean and precision of x instead
     of the unknowns' own, (n) or (B, n), in the units of `state`. tip_std: standard deviations (N, N m) of a component of the tip
-    residual, W^-1/2 of the paper's W on c; None: TIP_FORCE_STD and TIP_MOMENT_STD in the rod's scales. Errors: ValueError of
-    `check`.
+    residual, W^-1/2 of the paper's W on c, which then stay to the end; None: c is zero at the answer, and TIP_FORCE_STD and
+    TIP_MOMENT_STD in the rod's scales ease the way there. Errors: ValueError of `check`.
     """
 
     robot: Robot
@@ -132,19 +131,15 @@ class Problem(Float64):
 
     @cached_property
     def tip_weights(self) -> Float[Tensor, " 6"]:
-        """1 / variance of the tip residual c (1/N^2, 1/(N m)^2): stiff, so that (17) holds to a milli-force-scale."""
+        """1 / variance of the tip residual c (1/N^2, 1/(N m)^2) on the way to the answer: (17) holds to a milli-force-scale."""
         rod = self.robot.rod
         force, moment = self.tip_std or (TIP_FORCE_STD * rod.force_scale, TIP_MOMENT_STD * rod.moment_scale)
         return torch.tensor([force] * 3 + [moment] * 3, dtype=DTYPE) ** -2
 
     @property
-    def exact_weights(self) -> Float[Tensor, "B z"]:
-        """W with the tip residual TIP_EXACT times stiffer: for the covariance of the result, not for the way there.
-
-        In truth (17) holds exactly. The slack that eases the iteration would widen the regions that are reported: by 1.6 across the
-        force, in Study 1 with 1 mm noise.
-        """
-        return torch.cat([self.weights[:, :-TIP_ROWS], TIP_EXACT**2 * self.weights[:, -TIP_ROWS:]], -1)
+    def exact_tip(self) -> bool:
+        """Whether (17) holds exactly at the answer."""
+        return self.tip_std is None
 
     @cached_property
     def seen(self) -> Int[Tensor, " B"]:

@@ -105,13 +105,16 @@ def fully_iterated(problem: Problem, x: Tensor) -> Tensor:
             break
         onward = base[live] + step[live]
         at = linearize(problem.take(live), onward)
-        lower = at.cost < lowest[live]
+        assert at.tip is not None
+        # A tip out of balance would look cheaper than it is: count by how far what is read has to move for c = 0.
+        cost = at.cost + ekf.square(at.A, torch.nn.functional.pad(at.tip.d, (problem.size - ekf.BASE, 0)))
+        lower = cost < lowest[live]
         done = lower & (at.decrement < SETTLED)
-        lowest[live] = torch.where(lower, at.cost, lowest[live])
+        lowest[live] = torch.where(lower, cost, lowest[live])
         # A step that went up is tried again from where it began, shorter; the next one is damped more.
         base[live] = torch.where(lower.unsqueeze(-1), onward, base[live])
         damping[live] = torch.where(lower, damping[live] / 4, damping[live] * 4)
-        fresh = ekf.solve_spd(at.A + damping[live, None, None] * eye, at.g.unsqueeze(-1)).squeeze(-1).nan_to_num(0.0)
+        fresh = at.tip.solve(at.A + damping[live, None, None] * eye, at.g)[0].nan_to_num(0.0)
         step[live] = torch.where(lower.unsqueeze(-1), fresh, 0.25 * step[live])
         live = live[~done]
     return lowest

@@ -50,7 +50,7 @@ def linear_innovation(iterations: int = 6) -> dict[str, list[float]]:
         for _ in range(iterations):
             errors[name].append(float((x - truth).norm()))
             A, g = ekf.information(H, sign * (z - (H @ x.unsqueeze(-1)).squeeze(-1)), w, x, zero, zero)
-            step, Sigma = ekf.update(ekf.predict(Sigma, zero + 1.0), A, g)
+            step, Sigma, _ = ekf.update(ekf.predict(Sigma, zero + 1.0), A, g)
             x = x + step
     return errors
 
@@ -73,7 +73,7 @@ def shape_innovation(study: Study, paper: bool, iterations: int) -> dict[str, li
             size = 1e3 * float((at.r[:, :-6].square().sum() / len(S)).sqrt())
             residuals[name].append(size if math.isfinite(size) else None)
             A, g = ekf.information(at.H, sign * at.r, problem.weights, x, problem.mean, problem.precision)
-            step, Sigma = ekf.update(ekf.predict(Sigma, settings.Q * one), A, g)
+            step, Sigma, _ = ekf.update(ekf.predict(Sigma, settings.Q * one), A, g)
             x = x + step * (settings.step_limit / step.abs().max()).clamp(max=1.0)
     return residuals
 
@@ -102,10 +102,10 @@ def index_choices() -> dict[str, float]:
 def damping(study: Study, powers: tuple[float, ...], count: int) -> dict[str, dict[str, float]]:
     """Per Q, over `count` cases: the mean first step from one start with Sigma_0 = 0, and the mean iterations (at most 200)."""
     problem = study.problem(study.noisy(0.0, 1, TOLD).take(torch.arange(count)))
-    at = linearize(problem, cold_start(problem).x)
+    at = linearize(problem, cold_start(problem).x, exact=False)
     rows = {}
     for Q in powers:
-        step, _ = ekf.update(ekf.predict(torch.zeros_like(at.A), Q * torch.ones(problem.size, dtype=torch.float64)), at.A, at.g)
+        step, *_ = ekf.update(ekf.predict(torch.zeros_like(at.A), Q * torch.ones(problem.size, dtype=torch.float64)), at.A, at.g)
         fit = estimate(problem, Settings(1.0, Q, max_iterations=200, restarts=()))
         rows[f"{Q:g}"] = {
             "step": float(step.norm(dim=-1).mean()),

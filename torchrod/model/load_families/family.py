@@ -4,13 +4,17 @@ import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ...mechanics.loads import Load
+from ...util.precision import DTYPE
 
 Gamma = Float[Tensor, "... n"]
 
+# Forces (in force scales), places (of the length) and the number of directions at which a single load is looked for.
+ELSEWHERE = (0.5, 1.5, 4.0), (0.4, 0.6, 0.8, 0.95), 8
 ETA_OF_RESTART = 3.0  # S(3) = 0.95
 WEAK_STD = 10.0  # of the priors that only keep unobservable directions finite (a load of no force has no location)
 
@@ -69,6 +73,14 @@ class LoadFamily(Protocol):
     def describe(self, gamma: Gamma) -> LoadReport:
         """Force, location and width of each load."""
         ...
+
+
+def single_loads() -> tuple[Float[Tensor, "C 2"], Float[Tensor, " C"]]:
+    """Forces (force scales) and eta of ELSEWHERE, all with all."""
+    sizes, places, directions = ELSEWHERE
+    turns = 2 * math.pi * torch.arange(directions, dtype=DTYPE) / directions
+    size, place, turn = torch.meshgrid(torch.tensor(sizes, dtype=DTYPE), torch.tensor(places, dtype=DTYPE), turns, indexing="ij")
+    return torch.stack([size * turn.cos(), size * turn.sin()], -1).flatten(0, 2), torch.logit(place).flatten()
 
 
 def logit(t: float) -> float:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ...mechanics.loads import GaussianLoads, Load, on_rod_fraction
 from ...util.precision import DTYPE
-from .family import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
+from .family import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit, single_loads
 
 WIDTH_OF_PRIOR = {"point": 1 / 100, "contact": 1 / 40, "distributed": 1 / 4}  # sigma / L: 4, 10 and 100 mm on the paper's rod
 LOG_C_STD = 1.0  # of the weak prior on log c
@@ -90,6 +90,16 @@ class GaussianCoordinates:
         each = gamma.unflatten(-1, (self.count, self.per_load))
         eta = each[..., 2:-1].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
         return torch.cat([factor * each[..., :2], eta, torch.full_like(each[..., -1:], self._log_c())], -1).flatten(-2)
+
+    def elsewhere(self) -> Float[Tensor, "C n"]:
+        """A single load of several sizes, places and directions (C, n), where to look when a fit is plainly wrong.
+
+        None, (0, n), for more loads, or for one whose place is known.
+        """
+        if self.count != 1 or self.locations is not None:
+            return torch.empty(0, self.size, dtype=DTYPE)
+        force, eta = single_loads()
+        return torch.cat([force, torch.stack([eta, torch.full_like(eta, self._log_c())], -1)], -1)
 
     def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
         """gamma + step where a force or a place is hardly known; else along [log |F|, direction, log location, log c].

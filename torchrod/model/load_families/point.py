@@ -9,7 +9,7 @@ from torch import Tensor
 from ...mechanics.lie import Vector
 from ...mechanics.loads import Load, PointForces
 from ...util.precision import DTYPE
-from .family import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit
+from .family import ETA_OF_RESTART, WEAK_STD, Gamma, LoadReport, logit, single_loads
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,13 @@ class PointCoordinates:
         each = gamma.unflatten(-1, (self.count, self.per_load))
         eta = each[..., 2:].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
         return torch.cat([factor * each[..., :2], eta], -1).flatten(-2)
+
+    def elsewhere(self) -> Float[Tensor, "C n"]:
+        """As in GaussianCoordinates."""
+        if self.count != 1 or self.locations is not None:
+            return torch.empty(0, self.size, dtype=DTYPE)
+        force, eta = single_loads()
+        return torch.cat([force, eta.unsqueeze(-1)], -1)
 
     def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
         """gamma + step."""
