@@ -131,6 +131,7 @@ def test_the_tip_condition_holds_to_first_order():
     x = torch.zeros(B, N)
     normal = ekf.normal_equations(H, r, w, torch.arange(Z - 6) // 2)
     A, g, _ = normal.readings.whole(x, *no_prior(x))
+    assert normal.tip is not None
     step, covariance = normal.tip.solve(A, g)
     expected = conditioned(H, r, w)
     assert torch.allclose(step, expected[0], atol=1e-9)
@@ -146,6 +147,7 @@ def test_a_tip_condition_without_a_solution_is_nan_and_alone():
     H, r, w, _ = problem()
     H[1, -6:, -1] = 0.0
     tip = ekf.normal_equations(H, r, w, torch.arange(Z - 6) // 2).tip
+    assert tip is not None
     assert torch.isnan(tip.d[1]).all() and torch.isnan(tip.T[1]).all()
     assert torch.isfinite(tip.d[[0, 2]]).all() and torch.isfinite(tip.T[[0, 2]]).all()
 
@@ -158,6 +160,7 @@ def test_an_exact_iteration_damps_and_adapts_under_the_tip_condition():
     at = replace(ekf.Iterate.start(x, Sigma, 0.0), cap=torch.tensor([torch.inf, 0.3, 0.0]))
     after = ekf.advance(at, normal, Sigma, prior, Q, ekf.Limits(step=torch.inf, exact=True))
     A, g, _ = normal.readings.whole(x, *prior)
+    assert normal.tip is not None
     promised = ekf.square(A, normal.tip.solve(A, g)[0])
     inflated = torch.minimum(promised / (Z - 6), at.cap)
     readings = torch.cat([H[:, :-6], torch.eye(N).repeat(B, 2, 1), H[:, -6:]], 1)

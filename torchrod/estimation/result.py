@@ -105,7 +105,8 @@ class Estimate:
     estimation.starts Origin and Fate). tension, tension_std (B, T) N: as found; None where they are taken as exact. outlier (B, G):
     groups of rows (a marker each) that a robust fit has left aside. cost (B,): what was minimized; chi2: the same of the other
     groups, as the normal distribution has it. dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit
-    that does not explain the data.
+    that does not explain the data. coarse (B,): steps that were refined as far as they go do not follow the load; unstable (B,): no
+    rod stays in the equilibrium that was found; neither is accepted.
     """
 
     x: Float[Tensor, "B n"]
@@ -135,6 +136,8 @@ class Estimate:
     origin: Int[Tensor, " B"]
     guess: Int[Tensor, " B"]
     fate: Int[Tensor, " B"]
+    coarse: Bool[Tensor, " B"]
+    unstable: Bool[Tensor, " B"]
 
     @property
     def warm_started(self) -> Bool[Tensor, " B"]:
@@ -210,6 +213,10 @@ class Estimate:
         status = Status(int(self.status[sample]))
         if status is not Status.CONVERGED or self.accepted[sample]:
             return status.message
+        if self.coarse[sample]:
+            return "Converged, but to a load that bends the rod too sharply for any steps: check units and marker order."
+        if self.unstable[sample]:
+            return "Converged, but to an unstable equilibrium, in which no rod stays: check gravity, mass and tip."
         chi2, dof = float(self.chi2[sample]), int(self.dof[sample])
         reason = f"chi2 = {chi2:.3g} for {dof} degrees of freedom"
         if chi2 < limit(dof):
@@ -372,4 +379,6 @@ def make_estimate(
         origin=origin.clone(),
         guess=origin.clone(),
         fate=torch.zeros_like(origin),
+        coarse=torch.zeros_like(status, dtype=torch.bool),
+        unstable=torch.zeros_like(status, dtype=torch.bool),
     )

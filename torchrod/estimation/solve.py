@@ -21,6 +21,7 @@ from ..util.errors import InputError
 from ..util.precision import DTYPE
 from ..util.status import Status
 from ..util.threads import one_thread
+from . import checks
 from . import filter as ekf
 from .evaluator import Evaluator, Run, evaluator, kernel_serves
 from .result import Estimate, limit, make_estimate
@@ -367,14 +368,41 @@ def estimate_each(
         raise ValueError("an estimate takes one gravity (3,) for all samples; estimate those of each gravity by themselves")
     parts, compiled, B = [], kernel_serves(problem), problem.batch
     size = CHUNK if compiled else CHUNK_TORCH
-    solve = solver_of(settings or Settings())
+    settings = settings or Settings()
+    solve = solver_of(settings)
     # What is kept from call to call, and the answer, must serve outside of inference mode, too.
     with torch.inference_mode(False), one_thread(compiled and B <= FEW):
         for first in range(0, B, size):
             index = torch.arange(first, min(first + size, B))
             chunk = problem if len(index) == B else problem.take(index)
-            parts.append(solve(chunk, _begin(start, chunk, index, B), progress))
+            fit = solve(chunk, _begin(start, chunk, index, B), progress)
+            parts.append(_stable(chunk, _followed(chunk, fit, settings)))
     return Estimate.cat(parts)
+
+
+def _followed(problem: Problem, fit: Estimate, settings: Settings) -> Estimate:
+    """The fit, repeated with twice the steps as long as they move what is read; what even MOST_STEPS do not follow is said."""
+    solve = solver_of(replace(settings, restarts=(), basins=0))
+    part, at = problem, torch.arange(problem.batch)
+    while True:
+        converged = (fit.status[at] == int(Status.CONVERGED)).nonzero().squeeze(-1)
+        part, at = part.take(converged), at[converged]
+        bad = (~checks.follows(part, fit.x[at])).nonzero().squeeze(-1) if len(at) else converged
+        part, at = part.take(bad), at[bad]
+        if not len(at) or part.steps >= checks.MOST_STEPS:
+            break
+        part = part.with_steps(min(2 * part.steps, checks.MOST_STEPS))
+        again = solve(part, Start.at(fit.x[at], Origin.OTHER_FIT))
+        kept = {name: getattr(fit, name) for name in ("origin", "guess", "fate", "restarts")}
+        fit = replace(fit.merged(again, at, torch.ones_like(at, dtype=torch.bool)), **kept)
+    return replace(fit, coarse=fit.coarse.index_fill(0, at, True), accepted=fit.accepted.index_fill(0, at, False))
+
+
+def _stable(problem: Problem, fit: Estimate) -> Estimate:
+    """The fit, with a word on equilibria in which no rod stays."""
+    index = (fit.status == int(Status.CONVERGED)).nonzero().squeeze(-1)
+    falls = index[~checks.stable(problem.take(index), fit.x[index])] if len(index) else index
+    return replace(fit, unstable=fit.unstable.index_fill(0, falls, True), accepted=fit.accepted.index_fill(0, falls, False))
 
 
 def _begin(start: StartRule | Start, chunk: Problem, index: Int[Tensor, " b"], count: int) -> Start:

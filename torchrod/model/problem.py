@@ -196,9 +196,11 @@ class Problem(Float64):
     @cached_property
     def coarse(self) -> "Problem":
         """The same with no more than COARSE_STEPS steps along the rod."""
-        if self.steps <= COARSE_STEPS:
-            return self
-        other = replace(self, steps=COARSE_STEPS)
+        return self if self.steps <= COARSE_STEPS else self.with_steps(COARSE_STEPS)
+
+    def with_steps(self, steps: int) -> "Problem":
+        """The same with another number of steps along the rod."""
+        other = replace(self, steps=steps)
         # What has been worked out so far does not depend on the steps.
         vars(other).update({name: value for name, value in vars(self).items() if name in _OF_READINGS})
         return other

@@ -53,7 +53,9 @@ class TorchrodPeer:
         This is what the tables call an iteration: h, H, the normal equations and the update. What is prepared once for all
         iterations of a fit is not in it.
         """
-        problem, at = self.problem(positions), ekf.Iterate(*(torch.from_numpy(a) for a in state))
+        problem = self.problem(positions)
+        x, Sigma, before, cap, done = (torch.from_numpy(a) for a in state)
+        at = ekf.Iterate(x, Sigma, before, cap, torch.ones_like(cap), done)
         run = replace(Filter(Settings()).init(problem, Start.at(at.x, Origin.OTHER_FIT)), at=at)
         once, index = evaluator(problem).iteration(run, ekf.Limits()), torch.arange(len(at.x))
         return lambda: once(index)

@@ -1,0 +1,54 @@
+"""What is checked of a fit that has converged: whether its steps follow its load, and whether its equilibrium is stable."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..mechanics.loads import PointWrenches
+from ..mechanics.statics import stable_at
+from ..model.problem import TIP_ROWS, Problem
+from .evaluator import evaluator
+
+STEP_SHARE = 0.05  # of chi^2: what the length of the steps may move in what is read
+MOST_STEPS = 640
+ERROR_OF_TURN = 0.02  # a rod that turns by a in each step and by b in all is off by less than this share of b a^4 of its length
+LIGHT = 1.5  # loads of fixed direction, in EI / L^2, below which no rod buckles: pi^2 / 4 at the tip of a column
+
+
+def follows(problem: Problem, x: Float[Tensor, "B n"]) -> Bool[Tensor, " B"]:
+    """Whether twice as many steps would read the same, to STEP_SHARE of chi^2.
+
+    A bound on the error of RK4 by how far the rod turns in a step clears nearly all samples; the others are evaluated.
+    """
+    rod, base = problem.robot.rod, problem.state.base.of(x)
+    soft = float(torch.linalg.eigvalsh(rod.K_bt.detach()).min())
+    moment = base[:, 3:].norm(dim=-1) + base[:, :3].norm(dim=-1) * rod.length
+    turn = moment * rod.length / soft + rod.reference_curvature[:, 1:].detach().norm(dim=-1).max() * rod.length
+    bound = ERROR_OF_TURN * turn * (turn / problem.steps) ** 4 * rod.length
+    chi2 = problem.weights[:, :-TIP_ROWS].sum(-1) * bound**2
+    doubtful = (~(chi2 < STEP_SHARE)).nonzero().squeeze(-1)
+    good = torch.ones(len(x), dtype=torch.bool)
+    if len(doubtful):
+        part, at = problem.take(doubtful), x[doubtful]
+        w = part.weights[:, :-TIP_ROWS]
+        here, finer = (evaluator(p).sums(at).r[:, :-TIP_ROWS] for p in (part, part.with_steps(2 * part.steps)))
+        good[doubtful] = ((w * (here - finer) ** 2).sum(-1) < STEP_SHARE) & torch.isfinite(finer).all(-1)
+    return good
+
+
+def stable(problem: Problem, x: Float[Tensor, "B n"]) -> Bool[Tensor, " B"]:
+    """Whether the equilibria at x are stable: `mechanics.statics.stable_at`."""
+    robot, state = problem.robot, problem.state
+    wrench = state.tip_wrench(x)
+    dead = wrench[:, :3].norm(dim=-1) + wrench[:, 3:].norm(dim=-1) / robot.rod.length + robot.weight.norm() * robot.rod.length
+    heavy = (dead * robot.rod.length**2 > LIGHT * robot.rod.bending_stiffness).nonzero().squeeze(-1)
+    good = torch.ones(len(x), dtype=torch.bool)
+    if len(heavy):
+        part, at, L = problem.take(heavy), x[heavy], robot.rod.length
+        loads = list(part.unknowns.loads.loads(at[:, state.loads.at])) if state.loads.size else []
+        if state.tip.size:
+            tip = wrench[heavy].unsqueeze(1)
+            loads.append(PointWrenches(tip[..., :3], tip[..., 3:], tip.new_tensor([L])))
+        q_tip = part.shape(at, differentiable=False).tip_q
+        good[heavy] = stable_at(robot, tuple(loads), part.pulling(at), q_tip, part.steps)
+    return good
