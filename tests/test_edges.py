@@ -25,9 +25,11 @@ from torchrod import (
     Settings,
     Tendons,
     Unknowns,
+    analyze,
     estimate,
     solve_shape,
 )
+from torchrod.analysis.alternatives import read_at_few_places
 from torchrod.cli import main
 from torchrod.estimation import checks
 from torchrod.mechanics.loads import on_rod_fraction
@@ -153,6 +155,26 @@ def test_an_unstable_equilibrium_is_said():
         lateral = (PointWrenches(wrench.view(1, 1, 3), torch.zeros(1, 1, 3), T([0.4])),)
         if holds:
             assert solve_shape(robot, lateral, None, s, 1).stable.all()
+
+
+def test_the_other_solutions_of_a_tip_pose():
+    """A rod whose tip is held nearer to its base, upright, bends to either side: the mirror image is told with its wrench."""
+    rod = Rod.circular(0.5, 0.002, 200e9, 80e9)
+    robot, offsets = Robot(rod), 0.02 * torch.cat([torch.zeros(1, 3), torch.eye(3)])
+    tip = T([0.0, -0.05, 0.4]) + offsets
+    sensors = [Markers(torch.full((4,), 0.5), tip.unsqueeze(0), 1e-4, offsets)]
+    problem = Problem(robot, Unknowns(GaussianCoordinates(0, 0.5, rod.force_scale), tip="wrench"), sensors)
+    found = analyze(problem)
+    assert found.estimate.accepted.all() and found.estimate.tip is not None
+    mirrored = found.estimate.tip[0] * T([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
+    (others,) = found.diagnosis.others
+    wrenches = torch.stack([other.tip for other in others if other.tip is not None])
+    nearest = int((wrenches - mirrored).norm(dim=-1).argmin())
+    assert torch.allclose(wrenches[nearest], mirrored, atol=1e-2 * float(mirrored.abs().max()))
+    assert abs(others[nearest].chi2 - float(found.estimate.chi2)) < 0.1
+    assert "explained as well by force" in found.message(0)
+    spread = replace(sensors[0], s=T([0.2, 0.3, 0.4, 0.5]))
+    assert not read_at_few_places(replace(problem, sensors=[spread])).any()
 
 
 @pytest.mark.parametrize("options", [(), ("--contacts", "auto")])

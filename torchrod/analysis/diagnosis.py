@@ -27,6 +27,7 @@ from ..model.problem import Problem
 from ..model.sensors import Markers
 from ..model.unknowns import Registration, Unknowns
 from ..util.status import Status
+from .alternatives import Solution
 from .count import free_parameters
 
 Cycle = tuple[int, ...]
@@ -37,6 +38,7 @@ SURE = 10.0  # BIC: by so much a base frame must do better before it speaks agai
 ITERATIONS = 60
 ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
+MOST_TOLD = 2  # other solutions in a message; the result file has them all
 CHUNK = 64  # samples at a time: the table of exchanges holds (markers)^3 numbers of each while it is made
 
 
@@ -47,7 +49,8 @@ class Diagnosis:
     s: (P,) m, of the markers. exchanged: per sample the groups of markers (counted from 0) whose labels look exchanged, mostly
     pairs. registration: (B, 6) [m, rad], an error of the base frame that explains the markers; NaN where none does. one_more: (B,),
     where one more load does. geometry: per sample what is wrong with its markers' unit, frame or order, or nothing. outliers: per
-    sample the markers without which a robust fit explains the others.
+    sample the markers without which a robust fit explains the others. others: per sample what else explains its readings; () where
+    nothing was looked for.
     """
 
     s: Float[Tensor, " P"]
@@ -56,6 +59,7 @@ class Diagnosis:
     one_more: Bool[Tensor, " B"]
     geometry: tuple[str, ...]
     outliers: tuple[Cycle, ...]
+    others: tuple[tuple[Solution, ...], ...] = ()
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
         """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
@@ -85,6 +89,12 @@ class Diagnosis:
             said.append("One more contact explains the markers; try more --contacts.")
         if self.geometry[sample]:
             said.append(self.geometry[sample])
+        if self.others and (others := self.others[sample]):
+            told = "; by ".join(f"{other.said} (chi2 = {other.chi2:.3g})" for other in others[:MOST_TOLD])
+            more = f"; and by {len(others) - MOST_TOLD} more" if len(others) > MOST_TOLD else ""
+            said.append(
+                f"The rod is read at few places, and its readings are explained as well by {told}{more}; add sensors along it."
+            )
         return " ".join(said)
 
 

@@ -17,6 +17,7 @@ from ..learned.warm_start import find_warm_start
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
 from ..model.unknowns import Scope, Unknowns
+from .alternatives import other_solutions
 from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, select
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
@@ -128,7 +129,8 @@ def analyze(
     if len(parts) == 1:
         problem = problem.of(parts[0][0])
     found = found if noise is None else noise.judged(found)
-    return Analysis(problem, found, parts, evidence, noise, frame, diagnose(problem, found, settings, parts))
+    diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
+    return Analysis(problem, found, parts, evidence, noise, frame, diagnosis)
 
 
 def _count(problem: Problem) -> int:

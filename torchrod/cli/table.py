@@ -66,7 +66,8 @@ def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noi
 
 def _noted(result: Estimate, diagnosis: Diagnosis) -> list[int]:
     """The samples of which there is something to say."""
-    return [b for b, fine in enumerate(result.accepted.tolist()) if not fine or diagnosis.message(b)]
+    sound = (result.accepted & ~result.unstable).tolist()
+    return [b for b, fine in enumerate(sound) if not fine or diagnosis.message(b)]
 
 
 def _summary(result: Estimate) -> str:

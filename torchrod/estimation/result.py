@@ -106,7 +106,8 @@ class Estimate:
     groups of rows (a marker each) that a robust fit has left aside. cost (B,): what was minimized; chi2: the same of the other
     groups, as the normal distribution has it. dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit
     that does not explain the data. coarse (B,): steps that were refined as far as they go do not follow the load; unstable (B,): no
-    rod stays in the equilibrium that was found; neither is accepted.
+    rod stays in the equilibrium that was found unless what pushes also holds it. Neither is accepted, but for an unstable one where
+    something pushes.
     """
 
     x: Float[Tensor, "B n"]
@@ -211,12 +212,15 @@ class Estimate:
 
     def _outcome(self, sample: int) -> str:
         status = Status(int(self.status[sample]))
+        if status is Status.CONVERGED and self.unstable[sample]:
+            return (
+                "Converged, but to an equilibrium that is unstable under dead loads: no rod stays there unless what pushes also "
+                "holds it; otherwise check gravity, mass and tip."
+            )
         if status is not Status.CONVERGED or self.accepted[sample]:
             return status.message
         if self.coarse[sample]:
             return "Converged, but to a load that bends the rod too sharply for any steps: check units and marker order."
-        if self.unstable[sample]:
-            return "Converged, but to an unstable equilibrium, in which no rod stays: check gravity, mass and tip."
         chi2, dof = float(self.chi2[sample]), int(self.dof[sample])
         reason = f"chi2 = {chi2:.3g} for {dof} degrees of freedom"
         if chi2 < limit(dof):

@@ -402,7 +402,12 @@ def _stable(problem: Problem, fit: Estimate) -> Estimate:
     """The fit, with a word on equilibria in which no rod stays."""
     index = (fit.status == int(Status.CONVERGED)).nonzero().squeeze(-1)
     falls = index[~checks.stable(problem.take(index), fit.x[index])] if len(index) else index
-    return replace(fit, unstable=fit.unstable.index_fill(0, falls, True), accepted=fit.accepted.index_fill(0, falls, False))
+    pushed = problem.state.external.stop > 0  # a contact is no dead load: it may hold the rod as well
+    return replace(
+        fit,
+        unstable=fit.unstable.index_fill(0, falls, True),
+        accepted=fit.accepted if pushed else fit.accepted.index_fill(0, falls, False),
+    )
 
 
 def _begin(start: StartRule | Start, chunk: Problem, index: Int[Tensor, " b"], count: int) -> Start:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..analysis.alternatives import Solution
 from ..analysis.count import Evidence
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
@@ -67,6 +68,12 @@ def _loads(of: Columns, b: int) -> list[dict[str, object]]:
         for k, force in enumerate(of["force"][b])
         if not math.isnan(force[0])
     ]
+
+
+def _solution(other: Solution) -> dict[str, object]:
+    loads = [{"force_local_N": f, "location_m": s} for f, s in zip(other.force.tolist(), other.location.tolist(), strict=True)]
+    tip = {} if other.tip is None else {"tip": {"force_N": other.tip[:3].tolist(), "moment_Nm": other.tip[3:].tolist()}}
+    return {"chi2": other.chi2, "loads": loads, **tip}
 
 
 def _message(estimate: Estimate, diagnosis: Diagnosis | None, b: int) -> str:
@@ -149,6 +156,8 @@ def _texts(
             record["evidence"] = json.dumps(_evidence(evidence, b))
         if diagnosis is not None:
             record["suspect_markers"] = json.dumps(diagnosis.suspects(b))
+            if diagnosis.others and diagnosis.others[b]:
+                record["other_solutions"] = _numbers([_solution(other) for other in diagnosis.others[b]])
         if noise is not None:
             record["noise"] = _numbers({"noise_m": float(noise.sigma[b]), "std_m": float(noise.std[b])})
         if profile is not None:
