@@ -103,16 +103,14 @@ def test_the_noise_is_found_and_what_it_costs_is_counted():
 
 @pytest.mark.many_fits
 def test_the_noise_is_found_without_knowing_the_number_of_loads():
-    """The richest fit does not settle in 3 % of these cases (9 % without a load): alone its noise is up to 14 times too large."""
+    """With a push, and without one, where the richest of the competing fits has nothing to hold on to."""
     g, candidates = torch.Generator().manual_seed(7), contacts(3)
     for positions in (
         drawn(2e-4)[0],
         T([0.0, 0.0, 1.0]) * S[:, None] + 2e-4 * torch.randn(B, 20, 3, generator=g),
     ):
         problem = posed(S, positions)
-        richest, _ = estimate_noise(problem.of(candidates[-1]))
         noise, known = estimate_noise_among(problem, candidates)
-        assert float(richest.sigma.max()) > 2 * 2e-4
         assert float(noise.sigma.max()) < 1.6 * 2e-4
         assert float(noise.sigma.min()) > 0.5 * 2e-4
         assert abs(float(noise.sigma.mean()) / 2e-4 - 1) < 0.03

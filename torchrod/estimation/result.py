@@ -240,10 +240,12 @@ class Estimate:
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
         """With the samples of `index` replaced by those of another attempt where that is better; every attempt is counted.
 
-        Better: accepted where this one is not, else of lower cost. What is said of the start that was given stays.
+        Better: accepted where this one is not, else of lower cost, unless only this one has converged. What is said of the start
+        that was given stays.
         """
         was, lower = self.accepted[index], other.cost < self.cost[index].nan_to_num(torch.inf)
-        better = (other.accepted & ~was) | ((other.accepted == was) & lower)
+        lost = (self.status[index] == int(Status.CONVERGED)) & (other.status != int(Status.CONVERGED))
+        better = (other.accepted & ~was) | ((other.accepted == was) & lower & ~lost)
         merged = self.merged(other, index, better)
         return replace(
             merged, guess=self.guess, fate=self.fate, restarts=merged.restarts.index_add(0, index, torch.ones_like(index))

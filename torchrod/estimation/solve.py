@@ -31,6 +31,7 @@ CHUNK = 4096  # samples per pass: what is done once per pass and iteration no lo
 FEW = 1024  # samples for which torch's own share is done sooner on one thread
 CHUNK_TORCH = 256  # the same without the compiled kernel, whose working set is larger
 NEAR = 10.0  # near: the next step promises to lower the cost by less than this
+ARRIVED = 7e-4  # the same, for a fit that has arrived: a little less than 1e-3, to which curved valleys then keep as well
 PAPER_GAIN = 1e-3  # of chi^2: what the paper calls converged is not printed
 PAPER_SIZES, PAPER_ALPHA = (50.0, 50.0, 0.03, 10.0), (3.0, 0.07)  # of [a_x, a_y (N/m), eta, c (1/m^2)] and of [N, N m]
 PAPER_RATIO = 2.0  # square root of Sigma_0 over Q
@@ -190,7 +191,7 @@ class Filter:
         """
         rough, fine = models
         limits = ekf.Limits(step=self.settings.step_limit, gain=self.settings.gain)
-        both = limits._replace(decrement=NEAR), limits._replace(exact=models[1].problem.exact_tip)
+        both = limits._replace(decrement=NEAR), limits._replace(exact=models[1].problem.exact_tip, decrement=ARRIVED)
         most = self.settings.max_iterations
         at_once = rough.iterate_all(fine, run, both, live, most)
         if at_once is not None:
