@@ -30,6 +30,7 @@ from torchrod import (
     kernel,
     solve_shape,
 )
+from torchrod.model.sensors import RodState
 
 P, L = 6, 0.4
 HASTY = Settings(max_iterations=20, restarts=())
@@ -191,6 +192,32 @@ def test_readings_in_another_frame_are_a_registration_away(name):
     assert torch.allclose(square(plain, x), square(other, full), rtol=1e-7)
 
 
+def test_conventions_that_the_cases_leave_out():
+    """A fibre turned by 90 degrees reads u_y as its kx; a cell the force in its own axes; a known end counts along the rod, too."""
+    import roma
+
+    nowhere = busy(markers(torch.zeros(2, P, 3)))
+    x = somewhere(nowhere)
+
+    def read(sensor) -> torch.Tensor:
+        return busy(sensor).h(x, False)[:, :-6]
+
+    plain = read(Curvature(S, torch.zeros(2, P, 3), 0.1)).unflatten(1, (P, 3))
+    turned = read(Curvature(S, torch.zeros(2, P, 3), 0.1, None, torch.full((P,), math.pi / 2))).unflatten(1, (P, 3))
+    assert torch.allclose(turned, torch.stack([plain[..., 1], -plain[..., 0], plain[..., 2]], -1))
+    axes, wrench = unit(4), nowhere.state.tip_wrench(x)
+    own = roma.unitquat_to_rotmat(axes)
+    wanted = torch.cat([wrench[:, :3] @ own, wrench[:, 3:] @ own], -1)
+    assert torch.allclose(read(TipWrench(torch.zeros(2, 6), 1.0, 1.0, "base", axes)), wanted)
+    points = curve(nowhere, x)[:, P:]
+    along = torch.nn.functional.normalize(points[:, -1] - points[:, -2], dim=-1)
+    beyond = torch.cat([points[:, :-1], points[:, -1:] + 0.005 * along.unsqueeze(1)], 1)
+    for known in (False, True):
+        line = busy(CentreLine(ALONG, beyond, 1e-3, ends=(False, known)))
+        off = (line.weights.sqrt() * line.h(x, False))[:, :-6].unflatten(1, (-1, 3))[:, -1].norm(dim=-1)
+        assert ((off > 4.8) == known).all()
+
+
 def some(*quick: str) -> list[Any]:
     """All cases; a plain run takes the quick ones."""
     return [pytest.param(name, marks=() if name in quick else pytest.mark.study) for name in study.CASES]
@@ -348,8 +375,12 @@ def test_a_load_too_few_is_told_without_markers():
 
 def test_a_camera_looks_at_the_rod():
     push = study.Push.drawn(2, 4, False)
-    read = study.camera().told(push.at(study.MANY))
+    sections = push.at(study.MANY)
+    read = study.camera().told(sections)
     assert isinstance(read, Camera)
+    nothing = torch.zeros(2, 6)
+    state = RodState(sections.p, unit(2, 20, 4), nothing, nothing, unit(2, 4), lambda: (nothing, nothing))
+    assert torch.allclose(read.predict(state), read.reading, rtol=1e-12)
     from dataclasses import replace
 
     def problem(**change: Any) -> Problem:
