@@ -68,9 +68,15 @@ from .model.load_families import PaperCoordinates as PaperCoordinates
 from .model.load_families import PointCoordinates as PointCoordinates
 from .model.problem import Problem as Problem
 from .model.sensors import BaseWrench as BaseWrench
+from .model.sensors import Camera as Camera
+from .model.sensors import CentreLine as CentreLine
+from .model.sensors import CoreStrains as CoreStrains
+from .model.sensors import Curvature as Curvature
+from .model.sensors import Directions as Directions
 from .model.sensors import Markers as Markers
 from .model.sensors import Poses as Poses
 from .model.sensors import Sensor as Sensor
+from .model.sensors import TipWrench as TipWrench
 from .model.unknowns import Registration as Registration
 from .model.unknowns import Scope as Scope
 from .model.unknowns import Unknowns as Unknowns

@@ -134,6 +134,8 @@ def calibrate(
 def _refuse(shapes: UnloadedShapes) -> None:
     """Raise ValueError for what no data of this kind can determine."""
     robot, markers = shapes.robot, shapes.markers
+    if not markers.isotropic:
+        raise ValueError("calibrate takes markers with one noise in all directions; give neither covariances nor s_std")
     if not bool(robot.gravity.any()):
         raise ValueError("the robot has no gravity, so its weight does not show; add gravity = [x, y, z] (m/s^2) to [rod]")
     if shapes.offsets and not len(robot.tendons):

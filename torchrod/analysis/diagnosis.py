@@ -24,7 +24,7 @@ from ..estimation.solve import Settings, estimate_each
 from ..model.load_families import GaussianCoordinates
 from ..model.marker_geometry import misplaced
 from ..model.problem import Problem
-from ..model.sensors import Markers
+from ..model.sensors import CentreLine, Markers
 from ..model.unknowns import Registration, Unknowns
 from ..util.status import Status
 from .alternatives import Solution
@@ -86,7 +86,7 @@ class Diagnosis:
                 "try --registration."
             )
         if bool(self.one_more[sample]):
-            said.append("One more contact explains the markers; try more --contacts.")
+            said.append("One more contact explains the readings; try more --contacts.")
         if self.geometry[sample]:
             said.append(self.geometry[sample])
         if self.others and (others := self.others[sample]):
@@ -211,7 +211,7 @@ def _explained(problem: Problem, own: Float[Tensor, " b"], settings: Settings) -
     by_frame, by_load = torch.full_like(own, torch.inf), torch.full_like(own, torch.inf)
     count = getattr(unknowns.loads, "count", 0)
     tried = [(unknowns, refused)] + [(_with_loads(unknowns, k), everyone) for k in {1, count - 1} - {count}]
-    for some, index in tried if unknowns.registration is None else ():
+    for some, index in tried if unknowns.registration is None and problem.sees_frame else ():
         if some is None or not len(index):
             continue
         part = problem.of(replace(some, registration=Registration())).take(index)
@@ -240,8 +240,7 @@ def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
         return [()] * problem.batch
     fit = estimate_each(problem, replace(settings, robust=ROBUST))
     few = fit.outlier.sum(-1) <= FEW * markers.present.sum(-1)
-    noise = markers.noise.unsqueeze(-1) if isinstance(markers.noise, Tensor) else markers.noise
-    told = fit.outlier & (fit.residual.norm(dim=-1) > CLEAR * noise) & (fit.accepted & few).unsqueeze(-1)
+    told = fit.outlier & (fit.residual.norm(dim=-1) > CLEAR * markers.deviation) & (fit.accepted & few).unsqueeze(-1)
     return [tuple(row.nonzero().flatten().tolist()) for row in told]
 
 
@@ -266,7 +265,9 @@ def diagnose(
     markers, L = problem.markers, problem.robot.rod.length
 
     def misplaced_at(b: int) -> str:
-        return "" if markers is None else misplaced(markers, b, L)
+        if markers is not None:
+            return misplaced(markers, b, L)
+        return next((said for c in problem.sensors if isinstance(c, CentreLine) and (said := c.misplaced(b))), "")
 
     for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():
         geometry[b] = misplaced_at(b)

@@ -97,8 +97,8 @@ def estimate_noise(
     nothing tells the noise: give a fit of `with_noise(problem, sigma)` to Noise.judged. Errors: ValueError as torchrod.estimate,
     and for other sensors.
     """
-    if problem.markers is None:
-        raise ValueError("the noise can be estimated of markers alone; state the noise where other sensors were read as well")
+    if problem.markers is None or problem.markers.s_std is not None:
+        raise ValueError("the noise can be estimated of markers alone, at known arc lengths; state the noise where more was read")
     L, settings = problem.robot.rod.length, replace(settings or Settings(), restarts=())
     sigma = torch.full((problem.batch,), FIRST * L, dtype=torch.float64)
     begin: StartRule | Start = start

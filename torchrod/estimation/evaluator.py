@@ -1,8 +1,8 @@
 """How a problem is evaluated: by the compiled kernel where it serves, else by the torch model, which is the definition.
 
 `evaluator` chooses once for each problem; whoever holds an Evaluator does not ask which one it is. The kernel serves markers on any
-robot of one section under the load families of model.load_families; other sensors, and load families of a user's own, go through
-the torch model with a compiled march.
+robot of one section under the load families of model.load_families; other sensors, markers with covariances or uncertain arc
+lengths, and load families of a user's own, go through the torch model with a compiled march.
 """
 
 import math
@@ -101,8 +101,10 @@ def evaluator(problem: Problem, nu: float = math.inf) -> Evaluator:
 
 def kernel_serves(problem: Problem) -> bool:
     """Whether the kernel can do the fit. Nodes that move with a point load take along neither curvature nor routing that vary."""
-    robot, family = problem.robot, family_of(problem)
-    if problem.markers is None or family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
+    robot, family, markers = problem.robot, family_of(problem), problem.markers
+    if markers is None or not markers.isotropic:
+        return False
+    if family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
     if family == "point":
         straight = all(len(t.routing) == 1 for t in robot.tendons.tendons)

@@ -14,7 +14,7 @@ from ..kernel import Sums
 from ..mechanics.jacobian import pointwise_jacobian
 from ..mechanics.loads import GaussianLoads, Load, PointForces, on_rod_fraction
 from ..model.load_families import GaussianCoordinates, LoadFamily
-from ..model.problem import TIP_ROWS
+from ..model.problem import TIP_ROWS, Problem
 from ..util.precision import DTYPE
 from ..util.status import Status
 from . import filter as ekf
@@ -226,7 +226,8 @@ class Estimate:
         if chi2 < limit(dof):
             reason = "most markers were left aside, or neighbouring residuals are too much alike for noise"
         remedy = "allow more contacts, state more noise, or check tensions, gravity and registration"
-        return f"Converged, but {reason}: the model does not explain the markers; {remedy}."
+        what = "markers" if self.residual.shape[1] else "readings"
+        return f"Converged, but {reason}: the model does not explain the {what}; {remedy}."
 
     def fitted_rod(self, sample: int, profile: Profile | None = None) -> FittedRod:
         """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""
@@ -332,6 +333,11 @@ def _only(mask: Bool[Tensor, "..."]) -> Callable[[Tensor], Tensor]:
     return lambda value: torch.where(mask.reshape(*mask.shape, *[1] * (value.ndim - mask.ndim)), value, torch.nan)
 
 
+def _placed(problem: Problem) -> Bool[Tensor, "B K"]:
+    """Which of the rows that are positions were read."""
+    return problem.distances((problem.weights > 0).to(DTYPE)).abs().amax(-1) > 0
+
+
 def make_estimate(
     evaluate: Evaluator,
     x: Float[Tensor, "B n"],
@@ -370,7 +376,7 @@ def make_estimate(
         base_wrench=kept(state.base.of(x)),
         registration=kept(state.registration.of(x)) if state.registration.size else None,
         centre_line=kept(sums.line),
-        residual=_only(problem.distances(problem.weights).amin(-1) > 0)(kept(problem.distances(rows))),
+        residual=_only(_placed(problem))(kept(problem.distances(rows))),
         row_residual=kept(rows),
         tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
         tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,

@@ -1,5 +1,6 @@
 """Where the filter starts, where that came from, and what it must beat."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -9,9 +10,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..model.problem import Problem
+from ..model.sensors import Camera
+from ..model.sensors.camera import BEHIND
 from ..util.precision import Float64
+from . import filter as ekf
 from .at_rest import at_rest, without_load
-from .evaluator import evaluator
+from .evaluator import evaluator, normal
+
+PUSH, PUSH_ANGLES = 3.0, tuple(0.4 + k * math.pi / 2 for k in range(4))  # of a camera's starts, force scales and rad
+FOLLOWED = 12  # iterations from each of them
 
 
 class Origin(IntEnum):
@@ -96,8 +103,56 @@ def in_equilibrium(
 
 
 def cold_start(problem: Problem) -> Start:
-    """No load where the load family says so, and the base wrench of the rod in equilibrium without it."""
-    return Start.at(cold_from(problem, without_load(problem).wrench.nan_to_num(0.0)), Origin.COLD)
+    """No load where the load family says so, and the base wrench of the rod in equilibrium without it.
+
+    Where nothing but cameras says where the rod is, a start of each sample's own: a rod that bends towards one looks much as if it
+    bent away, so pushes to four sides are followed for a while, and the cheapest is taken. Errors: ValueError where the unloaded
+    rod is behind a camera in every sample.
+    """
+    rest = without_load(problem)
+    x = cold_from(problem, rest.wrench.nan_to_num(0.0))
+    if any(isinstance(sensor, Camera) for sensor in problem.sensors):
+        _check_cameras(problem, rest.p)
+        placed = problem.distances(problem.weights).shape[1]
+        x = x if placed or not problem.state.loads.size else _of_four_ways(problem, x)
+    return Start.at(x, Origin.COLD)
+
+
+def _check_cameras(problem: Problem, p: Float[Tensor, "B P 3"]) -> None:
+    first = 0
+    for sensor in problem.sensors:
+        at = slice(first, first + len(sensor.s))
+        if isinstance(sensor, Camera) and bool(((sensor.depth(p[:, at]) <= 0) & sensor.present).any(-1).all()):
+            raise ValueError(f"without load {BEHIND}")
+        first = at.stop
+
+
+def _of_four_ways(problem: Problem, cold: Float[Tensor, "B n"]) -> Float[Tensor, "B n"]:
+    """The cheapest of where a few iterations lead from pushes to four sides; x of a cold start where no push can be told of."""
+    family, start = problem.unknowns.loads, problem.unknowns.loads.start().clone()
+    start[:2] = start.new_tensor([1.0, 0.0])  # of every family the first two entries push along x and y
+    newtons = float(family.describe(start).force.flatten()[0])
+    best, least = cold, torch.full((len(cold),), torch.inf, dtype=cold.dtype)
+    for angle in PUSH_ANGLES if newtons > 0 else ():
+        push = PUSH * problem.robot.rod.force_scale / newtons
+        start[:2] = start.new_tensor([push * math.cos(angle), push * math.sin(angle)])
+        x, cost = _followed(problem, in_equilibrium(problem, start.expand(len(cold), -1)))
+        cheaper = cost < least
+        best, least = torch.where(cheaper.unsqueeze(-1), x, best), torch.where(cheaper, cost, least)
+    return best
+
+
+def _followed(problem: Problem, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n"], Float[Tensor, " B"]]:
+    """x after a few iterations of the filter on coarse steps, and its cost."""
+    coarse = problem.coarse
+    evaluate, eye = evaluator(coarse), torch.eye(problem.size, dtype=x.dtype).expand(len(x), -1, -1)
+    run = ekf.Iterate(x, eye, x, x.new_full((len(x),), torch.inf), torch.zeros(len(x), dtype=torch.bool))
+    for _ in range(FOLLOWED):
+        sums, prior = evaluate.sums(run.x), (coarse.mean, coarse.precision)
+        run = ekf.advance(run, normal(coarse, sums), eye, prior, x.new_ones(problem.size), ekf.Limits())
+        if bool(run.done.all()):
+            break
+    return run.x, evaluate.cost(run.x)
 
 
 def cold_from(problem: Problem, alpha: Float[Tensor, "B 6"]) -> Float[Tensor, "B n"]:

@@ -15,7 +15,6 @@ from ..mechanics.rod import Rod
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
 from ..model.sensors import Markers
-from ..model.sensors.sensor import variance
 from ..util.errors import InputError
 from .features import Features, features, is_active, noise_of, prior_log_c
 from .network import PER_LOAD, Network, load_checkpoint, turn_of_gamma
@@ -126,7 +125,7 @@ def _costs(problem: Problem, x: Float[Tensor, "B k n"], p: Float[Tensor, "B k P 
     square = (markers.positions.unsqueeze(1) - p).square().sum(-1)
     seen = torch.where(markers.present.unsqueeze(1), square, 0.0).sum(-1)
     mean, precision = problem.mean.unsqueeze(-2), problem.precision.unsqueeze(-2)
-    return seen / variance(markers.noise) + (precision * (mean - x) ** 2).sum(-1)
+    return seen / markers.deviation**2 + (precision * (mean - x) ** 2).sum(-1)
 
 
 RANGES = ("amp", "noise_over_length", "markers_seen", "shear_over_bending", "torsion_over_bending")
@@ -136,6 +135,8 @@ def _unknowns_misfit(card: dict[str, Any], problem: Problem) -> str | None:
     unknowns, coordinates = problem.unknowns, problem.unknowns.loads
     if problem.markers is None:
         return "it reads markers, and here other sensors were read as well"
+    if not problem.markers.alike:
+        return "it knows one noise for all markers of a sample; start cold where each has its own, or uncertain arc lengths"
     if not isinstance(coordinates, GaussianCoordinates) or not unknowns.scaled:
         return "it knows Gaussian loads in scaled coordinates only"
     if coordinates.locations is not None:

@@ -65,6 +65,23 @@ class Grid:
         return self.stages[..., 1:2].expand_as(self.stages)
 
 
+@dataclass(frozen=True)
+class Places:
+    """Single places s (P,) m along the rod, each on the base's side of what jumps there: what a table has of one stage each."""
+
+    s: Float[Tensor, " P"]
+
+    @property
+    def stages(self) -> Float[Tensor, "P 1"]:
+        """The places themselves."""
+        return self.s.unsqueeze(-1)
+
+    @property
+    def inside(self) -> Float[Tensor, "P 1"]:
+        """Just below each; just above at the base."""
+        return (self.s - 2 * SAME_POINT).clamp(min=SAME_POINT).unsqueeze(-1)
+
+
 def make_grid(
     length: float,
     outputs: Float[Tensor, " P"],

@@ -75,6 +75,11 @@ def product(a: Quaternion, b: Quaternion) -> Quaternion:
     return torch.cat([wa * vb + wb * va + cross(va, vb), wa * wb - (va * vb).sum(-1, keepdim=True)], -1)
 
 
+def conjugate(q: Quaternion) -> Quaternion:
+    """q*: of a unit quaternion the inverse."""
+    return torch.cat([-q[..., :3], q[..., 3:]], -1)
+
+
 def exponential(w: Vector) -> Quaternion:
     """The rotation by a rotation vector w (rad): [sin(|w| / 2) w / |w|, cos(|w| / 2)], by its series near zero."""
     t = 0.25 * (w * w).sum(-1, keepdim=True)

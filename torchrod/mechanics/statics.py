@@ -18,7 +18,7 @@ from ..util.by_value import Kept, key
 from ..util.errors import InputError
 from ..util.precision import as_float64
 from ..util.status import Status
-from .grid import DEFAULT_STEPS, Grid, make_grid, on_rod
+from .grid import DEFAULT_STEPS, Grid, Places, make_grid, on_rod
 from .integrate import march, march_linearized, states_at
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logarithm, matvec, rotate, turned
 from .loads import Load, LoadIntegrals, taken, total
@@ -42,7 +42,7 @@ PER_SAMPLE = ("p", "q", "base_wrench", "status", "residual", "iterations", "stab
 KEPT_STEPS = 256  # robots and marker layouts
 
 
-def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid) -> StageTable:
+def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid | Places) -> StageTable:
     """All that is known along the rod, at the stages of every step of the grid. tension: (..., T) readings, N."""
     s, inside = grid.stages, grid.inside
     integrals = total(loads, s, inside) + robot.weight_beyond(s)
@@ -96,13 +96,14 @@ def base_state(robot: Robot, alpha: Float[Tensor, "... 6"], table: StageTable) -
 class Shape:
     """The rod at the outputs: p (..., P, 3) m, q (..., P, 4), and the tip residual c (..., 6) [N, N m], section frame.
 
-    tip_q: (..., 4), the orientation of the last section.
+    tip_q: (..., 4), the orientation of the last section. wrench: (..., P, 6), [N~ (N), M~ (N m)] of mechanics.section (1).
     """
 
     p: Float[Tensor, "... P 3"]
     q: Float[Tensor, "... P 4"]
     tip_residual: Float[Tensor, "... 6"]
     tip_q: Float[Tensor, "... 4"]
+    wrench: Float[Tensor, "... P 6"]
 
 
 def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadIntegrals) -> Shape:
@@ -112,7 +113,7 @@ def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadI
     """
     p, q, N, M = states.split(STATE_PARTS, -1)
     c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond)
-    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :])
+    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :], states[..., :-1, 7:])
 
 
 def shape_from_base(

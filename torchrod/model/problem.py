@@ -8,24 +8,24 @@ equilibrium.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.func import jvp, vmap
 
-from ..mechanics.grid import DEFAULT_STEPS, on_rod
+from ..mechanics.grid import DEFAULT_STEPS, Places, on_rod
 from ..mechanics.integrate import march_linearized
 from ..mechanics.jacobian import forward_jacobian
-from ..mechanics.lie import Matrix, Vector, exponential, move, product, unrotate
+from ..mechanics.lie import Matrix, Vector, conjugate, exponential, move, product, unrotate
 from ..mechanics.loads import LoadIntegrals, total
 from ..mechanics.robot import Robot
-from ..mechanics.section import Section
+from ..mechanics.section import Section, derivative
 from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table, steps_of_rod
 from ..util.by_value import Kept, key
 from ..util.precision import DTYPE, Float64
-from .sensors import Markers, RodState, Sensor
+from .sensors import Markers, RodState, Sensor, TipWrench
 from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
@@ -187,6 +187,16 @@ class Problem(Float64):
         return self.weights.shape[-1] - TIP_ROWS >= self.state.free_size
 
     @property
+    def sees_frame(self) -> bool:
+        """Whether any sensor measures in a frame of its own, in which the base frame may be off."""
+        eye, none = torch.eye(3, dtype=DTYPE), torch.zeros(3, dtype=DTYPE)
+        return any(sensor.moved(eye, none) is not sensor for sensor in self.sensors)
+
+    @property
+    def _kinds(self) -> str:
+        return " and ".join(dict.fromkeys(type(sensor).__name__ for sensor in self.sensors))
+
+    @property
     def markers(self) -> Markers | None:
         """The markers, where they are all that was measured."""
         return only if len(self.sensors) == 1 and isinstance(only := self.sensors[0], Markers) else None
@@ -244,11 +254,16 @@ class Problem(Float64):
             raise ValueError(f"the sensors hold different numbers of samples ({counts}); give every sensor the same samples")
         if not bool(on_rod(s, L).all()):
             raise ValueError(f"marker arc lengths run from {s.min()} to {s.max()} m, outside the rod of 0 to {L} m")
-        if not self.determined:
-            P = len(s)
+        if self.unknowns.registration is not None and not self.sees_frame:
             raise ValueError(
-                f"{P} marker{'s' * (P != 1)} cannot determine {free} unknowns; add markers or drop loads or --registration"
+                f"{self._kinds} cannot tell where the base frame is; add markers, or take the frame as exact (no registration)"
             )
+        if not self.state.tip.size and any(isinstance(sensor, TipWrench) for sensor in self.sensors):
+            raise ValueError('TipWrench reads what acts on the tip, which is not unknown; give Unknowns(tip="force") or "wrench"')
+        if not self.determined:
+            P, read = len(s), self.weights.shape[-1] - TIP_ROWS
+            few = f"{P} marker{'s' * (P != 1)}" if self.markers is not None else f"{read} numbers read by {self._kinds}"
+            raise ValueError(f"{few} cannot determine {free} unknowns; add markers or drop loads or --registration")
         if tendons and self.tension is None:
             raise ValueError(f"the robot has {tendons} tendons but the shapes carry no tensions; add tension_1..tension_{tendons}")
         if self.tension is not None and tuple(self.tension.shape) != (self.batch, tendons):
@@ -282,16 +297,25 @@ class Problem(Float64):
         if state.registration.size:
             zeta = state.registration.of(x)
             p, q = move(zeta, p), product(exponential(zeta[..., 3:]).unsqueeze(-2), q)
-        rows, first, alpha = [], 0, state.base.of(x)
+        rows, first, alpha, tip = [], 0, state.base.of(x), state.tip_wrench(x)
         for sensor in self.sensors:
-            last = first + len(sensor.s)
-            rows.append(sensor.predict(RodState(p[..., first:last, :], q[..., first:last, :], alpha)))
-            first = last
+            at = slice(first, first + len(sensor.s))
+            strains = partial(self._strains, shape, x, at)
+            rows.append(sensor.predict(RodState(p[..., at, :], q[..., at, :], alpha, tip, shape.tip_q, strains)))
+            first = at.stop
         c = shape.tip_residual
         if state.tip.size:
-            wrench = state.tip_wrench(x).unflatten(-1, (2, 3))
-            c = c - unrotate(shape.tip_q.unsqueeze(-2), wrench).flatten(-2)
+            c = c - unrotate(shape.tip_q.unsqueeze(-2), tip.unflatten(-1, (2, 3))).flatten(-2)
         return torch.cat([*rows, c], -1)
+
+    def _strains(self, shape: Shape, x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
+        """v (-) and u (1/m) at the arc lengths `at` of all sensors', taken from the rates of mechanics.section."""
+        loads, robot = self.unknowns.loads.loads(x[..., self.state.loads.at]), self.robot
+        table = stage_table(robot, loads, self.pulling(x), Places(self.s[at])).stage(0)
+        q = shape.q[..., at, :]
+        y = torch.cat([shape.p[..., at, :], q, shape.wrench[..., at, :]], -1)
+        rate = derivative(Section.of(robot.rod.K_se, robot.rod.K_bt), y, table)
+        return unrotate(q, rate[..., :3]), 2 * product(conjugate(q), rate[..., 3:7])[..., :3]
 
     def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """h(x) and H = dh/dx.

@@ -5,8 +5,26 @@ joins the rows of all its sensors; nothing else knows what a row means.
 """
 
 from .base_wrench import BaseWrench
+from .camera import Camera
+from .centre_line import CentreLine
+from .core_strains import CoreStrains
+from .curvature import Curvature
+from .directions import Directions
 from .markers import Markers
 from .pose import Poses
 from .sensor import RodState, Sensor
+from .tip_wrench import TipWrench
 
-__all__ = ["BaseWrench", "Markers", "Poses", "RodState", "Sensor"]
+__all__ = [
+    "BaseWrench",
+    "Camera",
+    "CentreLine",
+    "CoreStrains",
+    "Curvature",
+    "Directions",
+    "Markers",
+    "Poses",
+    "RodState",
+    "Sensor",
+    "TipWrench",
+]

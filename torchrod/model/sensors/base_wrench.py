@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...mechanics.lie import Matrix, Vector, unrotate
 from ...util.precision import Float64
-from .sensor import RodState, check_noise, shape_error, variance
+from .sensor import RodState, as_numbers, check_noise, rows_of, shape_error, variance
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,7 @@ class BaseWrench(Float64):
 
     def __post_init__(self):
         super().__post_init__()
-        for name in ("force_noise", "moment_noise"):
-            if not isinstance(getattr(self, name), Tensor):
-                object.__setattr__(self, name, float(getattr(self, name)))
+        as_numbers(self, "force_noise", "moment_noise")
 
     @property
     def s(self) -> Float[Tensor, " P"]:
@@ -71,8 +69,7 @@ class BaseWrench(Float64):
 
     def take(self, index: Int[Tensor, " b"]) -> "BaseWrench":
         """The samples of an index."""
-        own = {name: x[index] for name in ("force_noise", "moment_noise") if isinstance(x := getattr(self, name), Tensor)}
-        return replace(self, readings=self.readings[index], **own)
+        return replace(self, **rows_of(self, index, "readings", "force_noise", "moment_noise"))
 
     def without(self, groups: Bool[Tensor, "B G"]) -> "BaseWrench":
         """No reading where the only group is named."""

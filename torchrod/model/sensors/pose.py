@@ -6,13 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ...mechanics.lie import Matrix, Vector, logarithm, matvec, product, rotate
+from ...mechanics.lie import Matrix, Vector, conjugate, logarithm, matvec, product, rotate
 from ...util.precision import Float64
-from .sensor import RodState, check_noise, shape_error, variance
-
-
-def _conjugate(q: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-    return torch.cat([-q[..., :3], q[..., 3:]], -1)
+from .sensor import RodState, as_numbers, check_noise, check_units, rows_of, shape_error, variance
 
 
 @dataclass(frozen=True)
@@ -38,9 +34,7 @@ class Poses(Float64):
 
     def __post_init__(self):
         super().__post_init__()
-        for name in ("noise", "angle_noise"):
-            if not isinstance(getattr(self, name), Tensor):
-                object.__setattr__(self, name, float(getattr(self, name)))
+        as_numbers(self, "noise", "angle_noise")
 
     @property
     def present(self) -> Bool[Tensor, "B P 2"]:
@@ -62,7 +56,7 @@ class Poses(Float64):
         p = rod.p if self.offsets is None else rod.p + rotate(rod.q, self.offsets)
         q = rod.q if self.mounting is None else product(rod.q, self.mounting)
         measured = torch.where(torch.isfinite(self.orientations), self.orientations, q.new_tensor([0.0, 0.0, 0.0, 1.0]))
-        return torch.cat([p, logarithm(product(_conjugate(measured), q))], -1).flatten(-2)
+        return torch.cat([p, logarithm(product(conjugate(measured), q))], -1).flatten(-2)
 
     @property
     def reading(self) -> Float[Tensor, "B rows"]:
@@ -83,8 +77,7 @@ class Poses(Float64):
 
     def take(self, index: Int[Tensor, " b"]) -> "Poses":
         """The samples of an index."""
-        own = {name: x[index] for name in ("noise", "angle_noise") if isinstance(x := getattr(self, name), Tensor)}
-        return replace(self, positions=self.positions[index], orientations=self.orientations[index], **own)
+        return replace(self, **rows_of(self, index, "positions", "orientations", "noise", "angle_noise"))
 
     def without(self, groups: Bool[Tensor, "B G"]) -> "Poses":
         """The sensors of these groups not read."""
@@ -110,9 +103,7 @@ class Poses(Float64):
             raise ValueError(f"{said} with {P} arc lengths and {B} samples")
         if not P or not B:
             raise ValueError("there are no poses; give at least one sample with one sensor")
-        for name, q in (("orientations", self.orientations), ("mounting", self.mounting)):
-            size = None if q is None else q.norm(dim=-1)
-            if size is not None and bool(((size - 1).abs() > 1e-3).any()):
-                raise ValueError(f"Poses.{name} must be unit quaternions (x, y, z, w); divide each by its norm")
+        check_units("Poses.orientations", self.orientations, "unit quaternions (x, y, z, w)")
+        check_units("Poses.mounting", self.mounting, "unit quaternions (x, y, z, w)")
         check_noise("Poses.noise", self.noise, "m")
         check_noise("Poses.angle_noise", self.angle_noise, "rad")

@@ -1,6 +1,7 @@
 """What every sensor supplies, and what it is told of the rod."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ...mechanics.lie import Matrix, Vector
+from ...mechanics.lie import Matrix, Vector, cross
 
 
 @dataclass(frozen=True)
@@ -17,12 +18,17 @@ class RodState:
 
     p (..., P, 3) m and q (..., P, 4) (x, y, z, w): position and orientation of the section at the sensor's arc lengths, in the
     measured frame (after the registration, where that is unknown). base_wrench (..., 6) [N, N m]: what the whole section carries at
-    the base, in the robot's base frame.
+    the base, in the robot's base frame. tip_wrench (..., 6) [N, N m]: the unknown dead wrench on the tip in the same frame, zero in
+    the entries that are not unknown; tip_q (..., 4): the orientation of the last section there. strains: works out v (..., P, 3)
+    (-) and u (..., P, 3) (1/m) of p' = R v, R' = R hat(u), in the section frame; what nobody asks for costs nothing.
     """
 
     p: Float[Tensor, "... P 3"]
     q: Float[Tensor, "... P 4"]
     base_wrench: Float[Tensor, "... 6"]
+    tip_wrench: Float[Tensor, "... 6"]
+    tip_q: Float[Tensor, "... 4"]
+    strains: Callable[[], tuple[Vector, Vector]]
 
 
 @runtime_checkable
@@ -82,7 +88,7 @@ class Sensor(Protocol):
         ...
 
 
-def shape_error(sensor: object, wanted: dict[str, tuple[int | None, ...]]) -> str | None:
+def shape_error(sensor: object, wanted: Mapping[str, tuple[int | None, ...]]) -> str | None:
     """What does not have its shape, in one sentence; None in a shape stands for any number."""
     for name, shape in wanted.items():
         value = getattr(sensor, name)
@@ -93,9 +99,36 @@ def shape_error(sensor: object, wanted: dict[str, tuple[int | None, ...]]) -> st
     return None
 
 
-def variance(noise: float | Float[Tensor, " B"]) -> float | Float[Tensor, "B 1"]:
-    """noise^2, of all rows of a sample."""
-    return noise.unsqueeze(-1) ** 2 if isinstance(noise, Tensor) else noise**2
+def variance(noise: float | Float[Tensor, " B"], trailing: int = 1) -> float | Tensor:
+    """noise^2, of all rows of a sample, which stand in so many dimensions: a number, or (B, 1, ..)."""
+    return noise.reshape(-1, *[1] * trailing) ** 2 if isinstance(noise, Tensor) else noise**2
+
+
+def rows_of(sensor: object, index: Int[Tensor, " b"], *names: str) -> dict[str, Tensor]:
+    """The samples of an index of those fields that are tensors with a row for each sample."""
+    return {name: x[index] for name in names if isinstance(x := getattr(sensor, name), Tensor)}
+
+
+def as_numbers(sensor: object, *names: str) -> None:
+    """Make numbers of those fields that are neither tensors nor None, in place, as a sensor is made."""
+    for name in names:
+        value = getattr(sensor, name)
+        if value is not None and not isinstance(value, Tensor):
+            object.__setattr__(sensor, name, float(value))
+
+
+def normals(a: Float[Tensor, "... 3"]) -> tuple[Vector, Vector]:
+    """Two unit vectors normal to unit vectors a and to one another."""
+    least = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a.dtype)
+    first = cross(a, least)
+    first = first / first.norm(dim=-1, keepdim=True)
+    return first, cross(a, first)
+
+
+def check_units(name: str, x: Float[Tensor, "... k"] | None, what: str) -> None:
+    """Refuse vectors that are not of length 1; NaN, for those that were not read, passes."""
+    if x is not None and bool(((x.norm(dim=-1) - 1).abs() > 1e-3).any()):
+        raise ValueError(f"{name} must be {what}; divide each by its norm")
 
 
 def check_noise(name: str, noise: float | Tensor, unit: str) -> None:
