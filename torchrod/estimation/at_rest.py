@@ -77,7 +77,7 @@ def without_load(problem: Problem, s: Float[Tensor, " P"] | None = None) -> Rest
 
 def _weight(robot: Robot) -> float:
     """In EI / L^3; infinite where the rod has no stiffness to speak of."""
-    load = float(robot.weight.norm()) * robot.rod.length**3
+    load = robot.rod.mass * float(robot.gravity.norm()) * robot.rod.length**2
     return load / robot.rod.bending_stiffness if load < HEAVY * robot.rod.bending_stiffness else math.inf
 
 

@@ -100,13 +100,16 @@ def evaluator(problem: Problem, nu: float = math.inf) -> Evaluator:
 
 
 def kernel_serves(problem: Problem) -> bool:
-    """Whether the kernel can do the fit. Nodes that move with a point load take along neither curvature nor routing that vary."""
+    """Whether the kernel can do the fit.
+
+    Nodes that move with a point load take along neither a section nor a curvature nor a routing that vary.
+    """
     robot, family = problem.robot, family_of(problem)
     if problem.markers is None or family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
     if family == "point":
         straight = all(len(t.routing) == 1 for t in robot.tendons.tendons)
-        return kernel.available() and straight and len(robot.rod.reference_curvature) == 1
+        return kernel.available() and straight and len(robot.rod.reference_curvature) == 1 and robot.rod.pieces is None
     return kernel.available()
 
 
@@ -383,5 +386,5 @@ def _tables(problem: Problem, nu: float, x: Float[Tensor, "B n"] | None, w: Floa
         # Where a tension is unknown the kernel adds its error, and only then is it clamped at zero.
         tension = robot.tendons.true_tension(problem.tension, clamped=not problem.state.tension.size)
         tensors["tau"] = tension[:, None, None, :] * layout.active
-        counts = counts | {"newton": robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension)}
+        counts = counts | {"newton": robot.tendons.newton_steps(*robot.rod.sampled_stiffness, tension)}
     return kernel.FitTables.of(kernel.with_rows(tensors, len(w)), counts, layout.numbers | {"robust": nu})

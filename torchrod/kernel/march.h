@@ -10,6 +10,7 @@ struct Trace {
     Slope slope[4];
     V k[4][STATE], unscaled[4], h, inverse;
     int64_t row[4];
+    Stiffness K[3];  // at the stages in the order of the walk; the first where it does not vary
 };
 
 // section.py, rk4_step: step i of the values.
@@ -24,6 +25,9 @@ inline void rk4_step(const Group& g, V* y, int64_t i, bool reverse, Trace& t) {
     for (int e = 0; e < 4; e++) {
         t.row[e] = 3 * i + order[e];
         if (e != 2) stage_of(g, t.row[e], stage);  // the middle serves twice
+        const int64_t section = m.varying ? (e + 1) / 2 : 0;
+        if (m.varying && e != 2) stiffness_of(m, g.lanes, t.row[e], t.K[section]);
+        t.slope[e].K = &t.K[section];
         derivative(m, z, stage, t.k[e], t.slope[e]);
         if (e < 3)
             for (int c = 0; c < STATE; c++) z[c] = y[c] + (e < 2 ? 0.5 : 1.0) * t.h * t.k[e][c];
@@ -116,6 +120,7 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
     if (g.in_own_frame()) return walk_in_own_frame(g, y, dy, reverse, arrive);
     const bool plain = !m.tendons && !m.Wn.data && !m.Wm.data;
     static thread_local Trace trace;
+    if (!m.varying) stiffness_of(m, g.lanes, 0, trace.K[0]);
     arrive(reverse ? m.steps : 0, [] {});
     for (int64_t n = 0; n < m.steps; n++) {
         const int64_t i = reverse ? m.steps - 1 - n : n;

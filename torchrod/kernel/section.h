@@ -45,7 +45,7 @@ struct Balance {
 };
 
 // tendons.py, balanced_strains: the values.
-inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
+inline void balance(const Known& m, const Stiffness& K, const Stage& at, const V* w, Balance& b) {
     const V star[6] = {V{}, V{}, splat(1.0), at.u_star.c[0], at.u_star.c[1], at.u_star.c[2]};
     for (int i = 0; i < 6; i++) b.x[i] = star[i];
     for (int iteration = 0; iteration <= m.newton; iteration++) {
@@ -54,9 +54,9 @@ inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
         for (int i = 0; i < 3; i++) {
             misfit[i] = w[i], misfit[3 + i] = w[3 + i];
             for (int j = 0; j < 3; j++) {
-                misfit[i] -= m.K_se[3 * i + j] * (b.x[j] - star[j]);
-                misfit[3 + i] -= m.K_bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
-                J[6 * i + j] = splat(m.K_se[3 * i + j]), J[6 * (3 + i) + 3 + j] = splat(m.K_bt[3 * i + j]);
+                misfit[i] -= K.se[3 * i + j] * (b.x[j] - star[j]);
+                misfit[3 + i] -= K.bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
+                J[6 * i + j] = K.se[3 * i + j], J[6 * (3 + i) + 3 + j] = K.bt[3 * i + j];
             }
         }
         for (int64_t t = 0; t < m.tendons; t++) {
@@ -91,6 +91,7 @@ struct Slope {
     V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS];
     V3 q, u, v, N, N_turning, M_turning;
     bool Jn_there, Jm_there;
+    const Stiffness* K;
     Balance balance;
 };
 
@@ -109,11 +110,11 @@ inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope
     if (at.Wm_there) M = M + turned(back, s.w, at.Wm), turning(s.q, s.w, -1, at.Wm, s.Jm);
     if (m.tendons) {
         const V w[6] = {s.N.c[0], s.N.c[1], s.N.c[2], M.c[0], M.c[1], M.c[2]};
-        balance(m, at, w, s.balance);
+        balance(m, *s.K, at, w, s.balance);
         s.v = part(s.balance.x), s.u = part(s.balance.x + 3);
         for (int64_t t = 0; t < m.tendons; t++) s.tau_unit[t] = at.tau_unit[t];
     } else {
-        s.v = matvec(m.K_se_inverse, s.N), s.u = at.u_star + matvec(m.K_bt_inverse, M);
+        s.v = matvec(s.K->se, s.N), s.u = at.u_star + matvec(s.K->bt, M);
         s.v.c[2] += 1.0;
     }
     for (int k = 0; k < 3; k++) {
@@ -163,9 +164,9 @@ template <bool Plain> INLINE void slope(const Known& m, const Slope& s, const V*
         }
         dv = part(dx), du = part(dx + 3);
     } else if (m.diagonal) {
-        for (int i = 0; i < 3; i++) dv.c[i] = m.K_se_inverse[4 * i] * dN.c[i], du.c[i] = m.K_bt_inverse[4 * i] * dM.c[i];
+        for (int i = 0; i < 3; i++) dv.c[i] = s.K->se[4 * i] * dN.c[i], du.c[i] = s.K->bt[4 * i] * dM.c[i];
     } else {
-        dv = matvec(m.K_se_inverse, dN), du = matvec(m.K_bt_inverse, dM);
+        dv = matvec(s.K->se, dN), du = matvec(s.K->bt, dM);
     }
     const V3 dq = part(z + 3), p = matvec(s.R, dv) + matvec4(s.Jv, z + 3), q = s.w * du + z[6] * s.u + cross(dq, s.u) + cross(s.q, du),
              N = cross(dNt, s.u) + cross(s.N_turning, du),

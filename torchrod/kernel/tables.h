@@ -18,12 +18,12 @@ struct Places {  // integers, likewise
 };
 
 struct Known {
-    int64_t steps, tendons, newton, diagonal;
-    const double *K_se, *K_bt, *K_se_inverse, *K_bt_inverse;  // 9 each
-    Table h;                                                  // (S)
-    Table Gm, Wn, Wm, u_star;                                 // (S, 3, 3)
-    Table L, dr, tau;                                         // (S, 3, T, 18), (S, 3, T, 3), (S, 3, T)
-    Places at;                                                // (P) nodes of the outputs
+    int64_t steps, tendons, newton, diagonal, varying;
+    Table K_se, K_bt, K_se_inverse, K_bt_inverse;  // (9); where the section varies, (S, 3, 9)
+    Table h;                                       // (S)
+    Table Gm, Wn, Wm, u_star;                      // (S, 3, 3)
+    Table L, dr, tau;                              // (S, 3, T, 18), (S, 3, T, 3), (S, 3, T)
+    Places at;                                     // (P) nodes of the outputs
     int64_t outputs;
 };
 
@@ -47,6 +47,16 @@ INLINE bool any(Mask m) {
     int64_t r = 0;
     for (int i = 0; i < W; i++) r |= m[i];
     return r != 0;
+}
+
+// A section's stiffness: with tendons K_se and K_bt, without their inverses.
+struct Stiffness {
+    V se[9], bt[9];
+};
+inline void stiffness_of(const Known& m, const Lanes& lanes, int64_t row, Stiffness& K) {
+    const int64_t at = m.varying ? 9 * row : 0;
+    const Table &se = m.tendons ? m.K_se : m.K_se_inverse, &bt = m.tendons ? m.K_bt : m.K_bt_inverse;
+    for (int64_t x = 0; x < 9; x++) K.se[x] = fetch(se, lanes, at + x), K.bt[x] = fetch(bt, lanes, at + x);
 }
 
 // All that is known at one stage, for the samples in the lanes.

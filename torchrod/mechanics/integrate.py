@@ -15,7 +15,7 @@ from torch.func import jvp, vmap
 from .. import kernel
 from .grid import Grid
 from .lie import Vector
-from .section import Section, StageTable, State, rk4_step
+from .section import MATRICES, Section, StageTable, State, rk4_step
 
 
 def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bool = False) -> Float[Tensor, "... S1 13"]:
@@ -46,10 +46,10 @@ def known(
     section: Section, table: StageTable, grid: Grid, keep: Int[Tensor, "*B P"]
 ) -> tuple[dict[str, Tensor | None], dict[str, int]]:
     """What the kernel is handed of a robot on a grid: struct Known by name. A table keeps its row per sample where it has one."""
-    t, loads = table.tendons, table.loads
-    diagonal = all(bool((K - torch.diag(K.diagonal()) == 0).all()) for K in (section.K_se, section.K_bt))
+    t, loads, of = table.tendons, table.loads, table.section or section
+    diagonal = all(bool((K - torch.diag_embed(K.diagonal(dim1=-2, dim2=-1)) == 0).all()) for K in (of.K_se, of.K_bt))
     tensors: dict[str, Tensor | None] = {
-        **{name: getattr(section, name).contiguous() for name in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")},
+        **{name: getattr(of, name).reshape(*of.K_se.shape[:-2] or (1, 1), 3, 3).contiguous() for name in MATRICES},
         **{"h": grid.h.contiguous(), "u_star": table.u_star.contiguous(), "at": keep.contiguous()},
         **{name: None if (W := getattr(loads, name)) is None else W.contiguous() for name in ("Gm", "Wn", "Wm")},
     }
@@ -59,6 +59,7 @@ def known(
         "steps": grid.h.shape[-1],
         "tendons": 0 if t is None else t.tau.shape[-1],
         "newton": 0 if t is None else t.newton,
+        "varying": int(table.section is not None),
         "diagonal": int(diagonal),
         "outputs": keep.shape[-1],
     }

@@ -31,11 +31,15 @@ from .tendons import TendonTable, balanced_strains
 
 State = Float[Tensor, "... 13"]
 STATE_PARTS = [3, 4, 3, 3]
+MATRICES = ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")  # of a section
 
 
 @dataclass(frozen=True)
 class Section:
-    """What the section is made of: stiffnesses, their inverses and the unstretched direction e3."""
+    """What the section is made of: stiffnesses, their inverses and the unstretched direction e3.
+
+    One for the whole rod, or tensors of (..., S, 3, 3, 3) in a StageTable.
+    """
 
     K_se: Matrix
     K_bt: Matrix
@@ -56,16 +60,18 @@ class StageTable:
     loads: LoadIntegrals
     u_star: Vector
     tendons: TendonTable | None
+    section: Section | None = None  # where it varies along the rod
 
     def _map(self, function) -> "StageTable":
         def at(x: Tensor | None) -> Tensor | None:
             return None if x is None else function(x)
 
-        loads, t = self.loads, self.tendons
+        loads, t, of = self.loads, self.tendons, self.section
         return StageTable(
             LoadIntegrals(at(loads.G), at(loads.G2), at(loads.Gm), at(loads.Wn), at(loads.Wm)),
             function(self.u_star),
             None if t is None else TendonTable(function(t.L, 3), function(t.dr, 2), function(t.tau), t.newton),
+            None if of is None else replace(of, **{name: function(getattr(of, name), 2) for name in MATRICES}),
         )
 
     def step(self, i: int) -> "StageTable":
@@ -114,7 +120,7 @@ def section_wrench(q: Float[Tensor, "... 4"], N: Vector, M: Vector, e3: Vector, 
 def derivative(section: Section, y: State, at: StageTable) -> State:
     """dy/ds by (1)-(4)."""
     _, q, N_tilde, M_tilde = y.split(STATE_PARTS, -1)
-    loads = at.loads
+    loads, section = at.loads, at.section or section
     N, M = section_wrench(q, N_tilde, M_tilde, section.e3, loads)
     if at.tendons is None:
         v = section.e3 + matvec(section.K_se_inverse, N)

@@ -23,7 +23,7 @@ from .integrate import march, march_linearized, states_at
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logarithm, matvec, rotate, turned
 from .loads import Load, LoadIntegrals, taken, total
 from .robot import Robot
-from .section import STATE_PARTS, Section, StageTable, State, section_wrench
+from .section import MATRICES, STATE_PARTS, Section, StageTable, State, section_wrench
 from .stability import conjugate_points, follow
 from .tendons import strains_settled
 from .tip_problem import ORIENTATION_TOLERANCE, SETTLED, TipProblem, newton, turning
@@ -45,13 +45,14 @@ KEPT_STEPS = 256  # robots and marker layouts
 def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid) -> StageTable:
     """All that is known along the rod, at the stages of every step of the grid. tension: (..., T) readings, N."""
     s, inside = grid.stages, grid.inside
-    integrals = total(loads, s, inside) + robot.weight_beyond(s)
+    integrals, rod = total(loads, s, inside) + robot.weight_beyond(s, inside), robot.rod
     tendons = None
     if len(robot.tendons) and tension is not None:
         tau = robot.tendons.true_tension(tension)
-        newton = robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tau)
+        newton = robot.tendons.newton_steps(*rod.sampled_stiffness, tau)
         tendons = robot.tendons.table(s, inside, tau[..., None, None, :], newton)
-    return StageTable(integrals, robot.rod.curvature_at(s, inside), tendons)
+    section = None if rod.pieces is None else Section.of(*rod.pieces.stiffness(rod.K_se, rod.K_bt, s, inside))
+    return StageTable(integrals, rod.curvature_at(s, inside), tendons, section)
 
 
 def grid_for(robot: Robot, loads: tuple[Load, ...], outputs: Float[Tensor, " P"], steps: int) -> Grid:
@@ -250,7 +251,8 @@ def _increments(load: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
 
 
 def _tensors(robot: Robot, loads: tuple[Load, ...], *more: Tensor | None) -> list[Tensor]:
-    values = [robot.gravity, *vars(robot.rod).values(), *(x for load in loads for x in vars(load).values()), *more]
+    pieces = () if robot.rod.pieces is None else vars(robot.rod.pieces).values()
+    values = [robot.gravity, *vars(robot.rod).values(), *pieces, *(x for load in loads for x in vars(load).values()), *more]
     return [x for x in values if isinstance(x, Tensor)]
 
 
@@ -339,11 +341,11 @@ def steps_of_rod(robot: Robot, outputs: Float[Tensor, " P"]) -> int:
 
     def work_out() -> int:
         with torch.no_grad():
-            bare = Robot(replace(rod, reference_curvature=rod.reference_curvature.detach()))
+            bare = Robot(replace(rod, reference_curvature=rod.reference_curvature.detach(), masses=rod.masses.detach()))
             answer = _solve(bare, (), None, outputs.detach(), 1, DEFAULT_STEPS, ORIENTATION_TOLERANCE, None, False)
             return _halved(bare, (), None, answer, torch.tensor([0]), DEFAULT_STEPS, ORIENTATION_TOLERANCE, False)[1]
 
-    return _steps_kept(key((rod.length, rod.reference_curvature, outputs)), work_out)
+    return _steps_kept(key((rod.length, rod.reference_curvature, rod.knots, outputs)), work_out)
 
 
 @dataclass(frozen=True)
@@ -475,7 +477,7 @@ def _problem(
 
 
 def _detached(problem: TipProblem) -> TipProblem:
-    parts = (getattr(problem.section, n).detach() for n in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse", "e3"))
+    parts = (getattr(problem.section, n).detach() for n in (*MATRICES, "e3"))
     grid = Grid(problem.grid.nodes.detach(), problem.grid.outputs)
     return TipProblem(Section(*parts), problem.table.detached(), grid, problem.wrench.detach())
 
@@ -591,9 +593,8 @@ def _equilibrium(
     wrench = torch.cat([rotate(q[:, -1], n0), rotate(q[:, -1], m0)], -1)
     finite = torch.isfinite(states).flatten(1).all(-1)
     at_base = problem.table.step(0).stage(0)
-    balanced = strains_settled(
-        problem.section.K_se, problem.section.K_bt, problem.section.e3, at_base.u_star, n0.detach(), m0.detach(), at_base.tendons
-    )
+    section = at_base.section or problem.section
+    balanced = strains_settled(section.K_se, section.K_bt, section.e3, at_base.u_star, n0.detach(), m0.detach(), at_base.tendons)
     solved = finite & balanced & (residual <= max(10 * tolerance, SETTLED)) & stable
     valid = finite if valid is None else valid  # a march that overflows under dead loads is no fault of the numbers given
     status = torch.full_like(iterations, int(Status.NOT_CONVERGED))
