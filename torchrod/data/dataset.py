@@ -110,7 +110,9 @@ def _robot_record(robot: Robot) -> dict[str, object]:
         **({} if rod.pieces is None else {"pieces": {name: value.tolist() for name, value in vars(rod.pieces).items()}}),
         **({"masses": rod.masses.tolist()} if len(rod.masses) else {}),
         "tendons": [
-            {"routing": t.routing, "ends_at": t.ends_at} | ({"tension_offset": t.tension_offset} if t.tension_offset else {})
+            {"routing": t.routing, "ends_at": t.ends_at}
+            | ({"tension_offset": t.tension_offset} if t.tension_offset else {})
+            | ({"friction": t.friction, "motion": t.motion} if t.friction else {})
             for t in robot.tendons.tendons
         ],
     }

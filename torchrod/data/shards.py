@@ -200,7 +200,12 @@ def _robot(record: dict[str, Any]) -> Robot:
     if "masses" in record:
         rod = replace(rod, masses=torch.tensor(record["masses"], dtype=torch.float64))
     tendons = tuple(
-        Tendon(tuple((s, x, y) for s, x, y in t["routing"]), t["ends_at"], t.get("tension_offset", 0.0)) for t in record["tendons"]
+        Tendon(
+            tuple((s, x, y) for s, x, y in t["routing"]),
+            t["ends_at"],
+            **{name: t[name] for name in ("tension_offset", "friction", "motion") if name in t},
+        )
+        for t in record["tendons"]
     )
     return Robot(rod, Tendons(tendons), gravity, record["name"])
 

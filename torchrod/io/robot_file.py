@@ -26,7 +26,8 @@ MASS_KEYS = {"s", "mass"}
 SOFTEST, HARDEST = 1e4, 2e12  # Pa: below the softest silicone and above diamond
 RUBBER, SLENDER = 1e6, 1 / 40  # Pa, and a diameter over the length: so soft and so slender a rod does not hold itself
 MOST_COILS = 200  # turns of the unloaded rod
-TENDON_KEYS = {"offset", "routing", "ends_at", "tension_offset"}
+TENDON_KEYS = {"offset", "routing", "ends_at", "tension_offset", "friction", "motion"}
+MOTIONS = {"pull": 1.0, "release": -1.0}
 
 
 def _stiffness(where: str, value: object) -> torch.Tensor:
@@ -250,6 +251,15 @@ def _rod(path: Path, table: dict[str, Any]) -> Rod:
     return replace(Rod.from_stiffness(length, one.K_se[0], one.K_bt[0], float(one.mass[0]), rows), masses=masses)
 
 
+def _motion(where: str, value: object) -> float:
+    """Which way a tendon moves through the robot."""
+    if isinstance(value, str) and value in MOTIONS:
+        return MOTIONS[value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -1 <= value <= 1:
+        raise InputError(f'{where} is {shown(value)}; it must be "pull", "release" or a number from -1 to 1')
+    return float(value)
+
+
 def _tendon(where: str, value: object, length: float) -> Tendon:
     table = as_table(where, value, TENDON_KEYS)
     if ("offset" in table) == ("routing" in table):
@@ -268,6 +278,8 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
                 f"{where}.routing runs from {rows[0][0]} to {rows[-1][0]} m; it must cover 0 to the tendon's end, {ends_at} m"
             )
         tendon = Tendon(tuple((s, x, y) for s, x, y in rows), ends_at, correction)
+    mu = as_number(f"{where}.friction", table.get("friction", 0.0), least=0.0)
+    tendon = replace(tendon, friction=mu, motion=_motion(f"{where}.motion", table.get("motion", 1.0)))
     if max(math.hypot(x, y) for _, x, y in tendon.routing) > 0.5 * length:
         warnings.warn(f"{where} runs more than half the rod's length beside it; are its offsets in metres?", stacklevel=2)
     return tendon

@@ -23,10 +23,10 @@ from .integrate import march, march_linearized, states_at
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logarithm, matvec, rotate, turned
 from .loads import Load, LoadIntegrals, taken, total
 from .robot import Robot
-from .section import MATRICES, STATE_PARTS, Section, StageTable, State, section_wrench
+from .section import MATRICES, STATE, STATE_PARTS, Section, StageTable, State, section_wrench
 from .stability import conjugate_points, follow
 from .tendons import strains_settled
-from .tip_problem import ORIENTATION_TOLERANCE, SETTLED, TipProblem, newton, turning
+from .tip_problem import ORIENTATION_TOLERANCE, SETTLED, TipProblem, newton, newton_with_turning, turning, with_turning
 
 ROUGH_TOLERANCE = 1e-5  # rad: enough where a filter starts
 LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put on in increments, to stay on the principal branch
@@ -111,7 +111,7 @@ def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadI
 
     c = [N~ - G, M~ + e3 x G2 - Gm] at s = L+, zero in equilibrium
     """
-    p, q, N, M = states.split(STATE_PARTS, -1)
+    p, q, N, M = states[..., :STATE].split(STATE_PARTS, -1)
     c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond)
     return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :])
 
@@ -473,13 +473,14 @@ def _problem(
     for place in (load.breakpoints() for load in loads):
         if place is not None:  # torch has no exception for a sample: NaN makes it INVALID
             wrench = torch.where(on_rod(place, robot.rod.length).all(-1, keepdim=True), wrench, torch.nan)
-    return TipProblem(section, table, grid, wrench)
+    rubbing = None if table.tendons is None or table.tendons.friction is None else zero.new_zeros(B, len(robot.tendons))
+    return TipProblem(section, table, grid, wrench, rubbing)
 
 
 def _detached(problem: TipProblem) -> TipProblem:
     parts = (getattr(problem.section, n).detach() for n in (*MATRICES, "e3"))
     grid = Grid(problem.grid.nodes.detach(), problem.grid.outputs)
-    return TipProblem(Section(*parts), problem.table.detached(), grid, problem.wrench.detach())
+    return TipProblem(Section(*parts), problem.table.detached(), grid, problem.wrench.detach(), problem.turned)
 
 
 def _solve(
@@ -503,6 +504,11 @@ def _solve(
         if q_tip is None or not dead:
             r, _ = problem.base(q, q.new_zeros(B, 4, 0), 0 * one)
             q = turned(-r, q)  # exact where no load keeps its direction in the base frame
+        if problem.turned is not None:  # what they turn by if they had not, up to the tip: nearer than nothing
+            states, _ = problem.march(
+                q, q.new_zeros(B, 4, 0), one, torch.zeros(*problem.grid.nodes.shape[:-1], 1, dtype=torch.int64)
+            )
+            problem = replace(problem, turned=-states[:, 0, STATE:].nan_to_num(0.0))
         residual, iterations, stable = 0 * one, torch.zeros(B, dtype=torch.int64), torch.ones(B, dtype=torch.bool)
         valid = torch.isfinite(q).all(-1) if q_tip is None else torch.isfinite(q_tip).all(-1)
         if dead:
@@ -515,6 +521,13 @@ def _solve(
             else:
                 q, residual, iterations = newton(problem, q_tip, one, tolerance * one)
                 stable = _stable(problem, q, unique, sizes.pieces(robot))
+        if problem.turned is not None:
+            start = residual
+            problem, q, residual, more = newton_with_turning(problem, q, one, tolerance)
+            residual, iterations = torch.where(torch.isfinite(start), residual, start), iterations + more
+            if dead:
+                stable = stable & _stable(problem, q, sizes.unique_below(robot), sizes.pieces(robot))
+            whole = replace(whole, turned=problem.turned)
     equilibrium = _equilibrium(
         whole, problem, q, residual, iterations, stable, valid if dead else None, outputs, tolerance, gradients
     )
@@ -558,14 +571,17 @@ def _marched(whole: TipProblem, problem: TipProblem, q_tip: Quaternion) -> Float
     The tip's orientation solves r(q, theta) = 0, so that dq = -J^-1 dr: one more Newton step from the solution, J held, has just
     that.
     """
-    _, J = problem.base(q_tip, turning(q_tip), torch.ones_like(q_tip[:, 0]))
-    at, J_inverse = whole.grid.outputs_and_base, inverse3(J)
+    one, at = torch.ones_like(q_tip[:, 0]), whole.grid.outputs_and_base
+    _, J = problem.base(q_tip, turning(q_tip), one) if problem.turned is None else with_turning(problem, q_tip, one)
+    J_inverse = inverse3(J) if problem.turned is None else torch.linalg.inv(J)
 
-    def states(q: Quaternion) -> Float[Tensor, "B P1 13"]:
-        y = torch.cat([torch.zeros_like(q[:, :3]), q, whole.wrench], -1)
-        return states_at(march(whole.section, y, whole.table, whole.grid, reverse=True), at)
+    def states(at_tip: TipProblem, q: Quaternion) -> Float[Tensor, "B P1 c"]:
+        return states_at(march(whole.section, at_tip.tip_state(q), whole.table, whole.grid, reverse=True), at)
 
-    return states(turned(-matvec(J_inverse, logarithm(states(q_tip)[:, -1, 3:7])), q_tip))
+    base = states(whole, q_tip)[:, -1]
+    move = -matvec(J_inverse, torch.cat([logarithm(base[:, 3:7]), base[:, STATE:]], -1))
+    moved = whole if whole.turned is None else replace(whole, turned=whole.turned + move[:, 3:])
+    return states(moved, turned(move[:, :3], q_tip))
 
 
 def _equilibrium(
@@ -586,7 +602,7 @@ def _equilibrium(
         at = problem.grid.outputs_and_base
         states, _ = problem.march(q_tip, q_tip.new_zeros(len(q_tip), 4, 0), torch.ones_like(residual), at)
         whole = problem
-    p, q, N, M = states.split(STATE_PARTS, -1)
+    p, q, N, M = states[..., :STATE].split(STATE_PARTS, -1)
     base = whole.table.step(0).stage(0).loads
     base = LoadIntegrals(Wn=base.Wn, Wm=base.Wm)
     n0, m0 = section_wrench(q[:, -1], N[:, -1], M[:, -1], whole.section.e3, base)
