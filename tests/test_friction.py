@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
 
 from tests.problems import check_jacobian, posed
 from tests.robots import T
@@ -43,6 +44,7 @@ from torchrod.mechanics.tendons import STRAIGHT
 from torchrod.util.by_value import key
 
 L, MU = 0.3, 0.2
+PIECES = 4  # of a gap between discs
 
 
 def rubbing(*tendons: Tendon, mu: float = MU, motion: float = 1.0) -> Tendons:
@@ -166,6 +168,53 @@ def test_against_a_solver_of_high_order(motion):
     assert abs(turning / y[18] - 1) < 1e-3
     without = solve_shape(hanging(0.0), (tip,), tension, T(places), 1)
     assert (without.p - shape.p).abs().max() > 1e-3
+
+
+def disc_by_disc(discs: int, tension: float, EI: float, r: float) -> np.ndarray:
+    """The tip (x, z) of a plane rod with so many discs, whose tendon runs straight from hole to hole and rubs in the holes alone.
+
+    In a gap the rod carries what balances the tendon on the line through its two holes, whose angle is found gap by gap.
+    """
+    y, tau, way = np.zeros(3), tension, 0.0
+    h = L / discs / PIECES
+
+    def hole(y: np.ndarray) -> np.ndarray:
+        return y[:2] + r * np.array([math.cos(y[2]), -math.sin(y[2])])
+
+    for _ in range(discs):
+        first = hole(y)
+
+        def across(angle: float, start=y, first=first, tau=tau, way=way) -> tuple[float, np.ndarray, float]:
+            pull = tau * math.exp(-MU * abs(angle - way))
+            d = np.array([math.sin(angle), math.cos(angle)])
+
+            def rate(at: np.ndarray) -> np.ndarray:
+                a = first - at[:2]
+                return np.array([math.sin(at[2]), math.cos(at[2]), -pull * (a[1] * d[0] - a[0] * d[1]) / EI])
+
+            end = start
+            for _ in range(PIECES):
+                k1 = rate(end)
+                k2 = rate(end + 0.5 * h * k1)
+                k3 = rate(end + 0.5 * h * k2)
+                end = end + h / 6 * (k1 + 2 * (k2 + k3) + rate(end + h * k3))
+            b = hole(end) - first
+            return b[0] * d[1] - b[1] * d[0], end, pull
+
+        angle = brentq(lambda x, at=across: at(x)[0], y[2] - 0.2, y[2] + 0.8, xtol=1e-12)
+        _, y, tau = across(angle)
+        way = angle
+    return y[:2]
+
+
+def test_discs_are_what_it_converges_to():
+    """With the square of their spacing."""
+    EI, r, tension = 0.01, 0.008, 4.0
+    rod = Rod.from_stiffness(L, 1e9 * torch.eye(3), EI * torch.eye(3))
+    tip = solve_shape(Robot(rod, rubbing(straight())), (), T([[tension]]), T([L]), 1).p[0, 0, [0, 2]].numpy()
+    errors = [float(np.linalg.norm(disc_by_disc(n, tension, EI, r) - tip)) for n in (10, 20, 40)]
+    assert errors[0] < 5e-3
+    assert all(3.9 < a / b < 4.2 for a, b in pairwise(errors)), errors
 
 
 @needs_compiler

@@ -104,11 +104,14 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
     const V h = (reverse ? -1.0 : 1.0) * fetch(m.h, g.lanes, i);
     const int64_t first = reverse ? 2 : 0, row[4] = {3 * i + first, 3 * i + 1, 3 * i + 1, 3 * i + 2 - first};
     V3 S[4], B[4];
-    for (int e = 0; e < 4; e++)
+    for (int e = 0; e < 4; e++) {
+        const bool again = e == 2 || (e && !m.varying);
         for (int k = 0; k < 3; k++) {
             const int64_t at = 4 * k + (m.varying ? 9 * row[e] : 0);
-            S[e].c[k] = fetch(m.K_se_inverse, g.lanes, at), B[e].c[k] = fetch(m.K_bt_inverse, g.lanes, at);
+            S[e].c[k] = again ? S[e - 1].c[k] : fetch(m.K_se_inverse, g.lanes, at);
+            B[e].c[k] = again ? B[e - 1].c[k] : fetch(m.K_bt_inverse, g.lanes, at);
         }
+    }
     Stages s;
     body_stages(g, y, row, h, S, B, s);
     const V half = 0.5 * h, quarter = 0.25 * h, sixth = (1.0 / 6) * h, one = splat(1.0);
