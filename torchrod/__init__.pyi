@@ -54,6 +54,7 @@ from .mechanics.loads import GaussianLoads as GaussianLoads
 from .mechanics.loads import PointForces as PointForces
 from .mechanics.loads import PointWrenches as PointWrenches
 from .mechanics.loads import PolynomialLoads as PolynomialLoads
+from .mechanics.pieces import Piece as Piece
 from .mechanics.robot import Robot as Robot
 from .mechanics.rod import Rod as Rod
 from .mechanics.statics import Equilibrium as Equilibrium

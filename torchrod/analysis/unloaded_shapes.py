@@ -119,9 +119,11 @@ class UnloadedShapes:
             o = value[:, 1 + self.stiffness :] if self.offsets else self._known_offsets()
             tension = ((self.tension[index] + o.unsqueeze(-2)) / k.unsqueeze(-1)).flatten(0, 1)
         plain = Tendons(tuple(replace(t, tension_offset=0.0) for t in robot.tendons.tendons))
-        rod = replace(robot.rod, mass_per_length=torch.ones((), dtype=DTYPE))
+        none = robot.rod.masses[:0]
+        rod = replace(robot.rod, mass_per_length=torch.ones((), dtype=DTYPE), masses=none)
         trial = Robot(rod, plain, weight.flatten(0, 1))
-        shape, offsets = solve_shape(trial, (), tension, self.markers.s, M * b, self.steps), self.markers.offsets
+        points = (replace(robot, gravity=(g / k.unsqueeze(-1)).flatten(0, 1)).point_weights,) if len(robot.rod.masses) else ()
+        shape, offsets = solve_shape(trial, points, tension, self.markers.s, M * b, self.steps), self.markers.offsets
         p = shape.p if offsets is None else shape.p + rotate(shape.q, offsets)
         return p.unflatten(0, (M, b))
 

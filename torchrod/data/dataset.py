@@ -106,9 +106,13 @@ def _robot_record(robot: Robot) -> dict[str, object]:
         "length": rod.length,
         **{key: getattr(rod, key).tolist() for key in ("K_se", "K_bt", "mass_per_length", "reference_curvature")},
         "gravity": robot.gravity.tolist(),
-        # A tendon without an offset is recorded as before there were offsets, so that a specification keeps its checksum.
+        # What a robot does not have is not recorded, so that a specification keeps its checksum from version to version.
+        **({} if rod.pieces is None else {"pieces": {name: value.tolist() for name, value in vars(rod.pieces).items()}}),
+        **({"masses": rod.masses.tolist()} if len(rod.masses) else {}),
         "tendons": [
-            {"routing": t.routing, "ends_at": t.ends_at} | ({"tension_offset": t.tension_offset} if t.tension_offset else {})
+            {"routing": t.routing, "ends_at": t.ends_at}
+            | ({"tension_offset": t.tension_offset} if t.tension_offset else {})
+            | ({"friction": t.friction, "motion": t.motion} if t.friction else {})
             for t in robot.tendons.tendons
         ],
     }

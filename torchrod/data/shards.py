@@ -15,7 +15,7 @@ import os
 import uuid
 import zipfile
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from ..io.json_file import put_json
 from ..io.npz_file import UNREADABLE, read_arrays
+from ..mechanics.pieces import Pieces
 from ..mechanics.robot import Robot
 from ..mechanics.rod import Rod
 from ..mechanics.tendons import Tendon, Tendons
@@ -193,8 +194,18 @@ def _robot(record: dict[str, Any]) -> Robot:
         torch.tensor(record[key], dtype=torch.float64) for key in ("K_se", "K_bt", "reference_curvature", "gravity")
     )
     rod = Rod.from_stiffness(record["length"], K_se, K_bt, record["mass_per_length"], curvature)
+    if "pieces" in record:
+        parts = {name: torch.tensor(value, dtype=torch.float64) for name, value in record["pieces"].items()}
+        rod = replace(rod, pieces=Pieces(**parts))
+    if "masses" in record:
+        rod = replace(rod, masses=torch.tensor(record["masses"], dtype=torch.float64))
     tendons = tuple(
-        Tendon(tuple((s, x, y) for s, x, y in t["routing"]), t["ends_at"], t.get("tension_offset", 0.0)) for t in record["tendons"]
+        Tendon(
+            tuple((s, x, y) for s, x, y in t["routing"]),
+            t["ends_at"],
+            **{name: t[name] for name in ("tension_offset", "friction", "motion") if name in t},
+        )
+        for t in record["tendons"]
     )
     return Robot(rod, Tendons(tendons), gravity, record["name"])
 

@@ -127,7 +127,7 @@ def _vary(where: str, table: dict[str, Any], robots: tuple[Robot, ...]) -> dict[
         return {"tension": tension, "gravity": None}
     _choice(f"{where}.gravity", table["gravity"], ("any",))
     for robot in robots:
-        if float(robot.rod.mass_per_length) == 0:
+        if robot.rod.mass == 0:
             raise InputError(f"{where}.gravity is given but {robot.name} has no mass; add mass_per_length (kg/m) to its file")
     magnitude = table.get("gravity_magnitude", [STANDARD_GRAVITY, STANDARD_GRAVITY])
     return {"tension": tension, "gravity": _range(f"{where}.gravity_magnitude", magnitude)}

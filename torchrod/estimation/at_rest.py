@@ -43,7 +43,9 @@ def at_rest(problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, 
     )
     wrench, p = gamma.new_full((B, 6), torch.nan), gamma.new_full((B, P, 3), torch.nan)
     settled = torch.zeros(B, dtype=torch.bool)
-    light = problem.robot.gravity.ndim == 1 and math.isfinite(_weight(problem.robot))
+    # Where tendons rub, how far they have turned at the tip is unknown as well.
+    smooth = problem.robot.tendons.friction is None
+    light = smooth and problem.robot.gravity.ndim == 1 and math.isfinite(_weight(problem.robot))
     if light and family_of(plain) != "point" and kernel_serves(plain):
         increments = _increments(problem.robot) if q_tip is None else 1
         wrench, missed, p = KernelEvaluator(plain).balance(gamma, q_tip, increments, ROUGH_TOLERANCE)
@@ -77,7 +79,7 @@ def without_load(problem: Problem, s: Float[Tensor, " P"] | None = None) -> Rest
 
 def _weight(robot: Robot) -> float:
     """In EI / L^3; infinite where the rod has no stiffness to speak of."""
-    load = float(robot.weight.norm()) * robot.rod.length**3
+    load = robot.rod.mass * float(robot.gravity.norm()) * robot.rod.length**2
     return load / robot.rod.bending_stiffness if load < HEAVY * robot.rod.bending_stiffness else math.inf
 
 

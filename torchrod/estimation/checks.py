@@ -21,9 +21,8 @@ def follows(problem: Problem, x: Float[Tensor, "B n"]) -> Bool[Tensor, " B"]:
     A bound on the error of RK4 by how far the rod turns in a step clears nearly all samples; the others are evaluated.
     """
     rod, base = problem.robot.rod, problem.state.base.of(x)
-    soft = float(torch.linalg.eigvalsh(rod.K_bt.detach()).min())
     moment = base[:, 3:].norm(dim=-1) + base[:, :3].norm(dim=-1) * rod.length
-    turn = moment * rod.length / soft + rod.reference_curvature[:, 1:].detach().norm(dim=-1).max() * rod.length
+    turn = moment * rod.length / rod.softest + rod.reference_curvature[:, 1:].detach().norm(dim=-1).max() * rod.length
     bound = ERROR_OF_TURN * turn * (turn / problem.steps) ** 4 * rod.length
     chi2 = problem.weights[:, :-TIP_ROWS].sum(-1) * bound**2
     doubtful = (~(chi2 < STEP_SHARE)).nonzero().squeeze(-1)
@@ -40,7 +39,7 @@ def stable(problem: Problem, x: Float[Tensor, "B n"]) -> Bool[Tensor, " B"]:
     """Whether the equilibria at x are stable: `mechanics.statics.stable_at`."""
     robot, state = problem.robot, problem.state
     wrench = state.tip_wrench(x)
-    dead = wrench[:, :3].norm(dim=-1) + wrench[:, 3:].norm(dim=-1) / robot.rod.length + robot.weight.norm() * robot.rod.length
+    dead = wrench[:, :3].norm(dim=-1) + wrench[:, 3:].norm(dim=-1) / robot.rod.length + robot.rod.mass * robot.gravity.norm()
     heavy = (dead * robot.rod.length**2 > LIGHT * robot.rod.bending_stiffness).nonzero().squeeze(-1)
     good = torch.ones(len(x), dtype=torch.bool)
     if len(heavy):

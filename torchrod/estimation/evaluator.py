@@ -100,7 +100,10 @@ def evaluator(problem: Problem, nu: float = math.inf) -> Evaluator:
 
 
 def kernel_serves(problem: Problem) -> bool:
-    """Whether the kernel can do the fit. Nodes that move with a point load take along neither curvature nor routing that vary."""
+    """Whether the kernel can do the fit.
+
+    Nodes that move with a point load take along neither a section nor a curvature nor a routing that vary.
+    """
     robot, family, markers = problem.robot, family_of(problem), problem.markers
     if markers is None or not markers.isotropic:
         return False
@@ -108,7 +111,7 @@ def kernel_serves(problem: Problem) -> bool:
         return False
     if family == "point":
         straight = all(len(t.routing) == 1 for t in robot.tendons.tendons)
-        return kernel.available() and straight and len(robot.rod.reference_curvature) == 1
+        return kernel.available() and straight and len(robot.rod.reference_curvature) == 1 and robot.rod.pieces is None
     return kernel.available()
 
 
@@ -385,5 +388,5 @@ def _tables(problem: Problem, nu: float, x: Float[Tensor, "B n"] | None, w: Floa
         # Where a tension is unknown the kernel adds its error, and only then is it clamped at zero.
         tension = robot.tendons.true_tension(problem.tension, clamped=not problem.state.tension.size)
         tensors["tau"] = tension[:, None, None, :] * layout.active
-        counts = counts | {"newton": robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tension)}
+        counts = counts | {"newton": robot.tendons.newton_steps(*robot.rod.sampled_stiffness, tension)}
     return kernel.FitTables.of(kernel.with_rows(tensors, len(w)), counts, layout.numbers | {"robust": nu})

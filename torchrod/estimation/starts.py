@@ -146,7 +146,7 @@ def _followed(problem: Problem, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, 
     """x after a few iterations of the filter on coarse steps, and its cost."""
     coarse = problem.coarse
     evaluate, eye = evaluator(coarse), torch.eye(problem.size, dtype=x.dtype).expand(len(x), -1, -1)
-    run = ekf.Iterate(x, eye, x, x.new_full((len(x),), torch.inf), torch.zeros(len(x), dtype=torch.bool))
+    run = ekf.Iterate.start(x, eye, torch.inf)
     for _ in range(FOLLOWED):
         sums, prior = evaluate.sums(run.x), (coarse.mean, coarse.precision)
         run = ekf.advance(run, normal(coarse, sums), eye, prior, x.new_ones(problem.size), ekf.Limits())

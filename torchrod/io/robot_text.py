@@ -1,13 +1,14 @@
 """A calibrated ROBOT.toml: the text of the old one with only the calibrated values changed; comments and order are kept.
 
-The text is edited line by line, for robots written as [rod] and [[tendons]] tables with one key per line. Whatever else TOML allows
-is recognized afterwards: the new text is read back by `robot_of` and compared, so that a file that says something else is never
-written.
+The text is edited line by line, for robots written as [rod], [[rod.sections]] and [[tendons]] tables with one key per line.
+Whatever else TOML allows is recognized afterwards: the new text is read back by `robot_of` and compared, so that a file that says
+something else is never written.
 """
 
 import re
 import tomllib
 import warnings
+from dataclasses import fields
 from pathlib import Path
 
 import torch
@@ -17,7 +18,7 @@ from ..util.errors import InputError
 from ..util.files import put_text, reading
 from .robot_file import robot_of
 
-HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([\w-]+)[ \t]*\]{1,2}[ \t]*(?:#.*)?$")
+HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([\w.-]+)[ \t]*\]{1,2}[ \t]*(?:#.*)?$")
 NUMBER = re.compile(r"(?<![\w.+-])[+-]?\d[\d_]*(?:\.\d[\d_]*)?(?:[eE][+-]?\d[\d_]*)?(?![\w.])")
 STIFFNESS_KEYS = ("youngs_modulus", "shear_modulus", "K_se", "K_bt")
 DIGITS = 10  # written of a value: far below what any calibration knows
@@ -72,11 +73,17 @@ def _put(lines: list[str], section: range, key: str, value: float) -> None:
     lines.insert(said[-1] + 1, f"{indent[0] if indent else ''}{key} = {_plain(value)}{end}")
 
 
-def calibrated_text(text: str, mass_per_length: float, stiffness_factor: float, offsets: tuple[float, ...] | None) -> str:
-    """ROBOT.toml's text with the mass per length (kg/m), its stiffnesses times a factor, and tension offsets (N) where given."""
+def calibrated_text(
+    text: str, mass_per_length: float, stiffness_factor: float, offsets: tuple[float, ...] | None, mass_factor: float | None = None
+) -> str:
+    """ROBOT.toml's text with the mass per length (kg/m), its stiffnesses times a factor, and tension offsets (N) where given.
+
+    mass_factor: instead of a mass per length, by what those of [rod] and of its sections are multiplied.
+    """
     lines = text.splitlines(keepends=True)
     # From the end of the file to its start, so that the line numbers ahead of an added line stay true.
-    edits = [(section, None) for section in _sections(lines, "rod")]
+    rods = _sections(lines, "rod")
+    edits = [(section, None) for section in rods + _sections(lines, "rod.sections")]
     if offsets is not None:
         edits += list(zip(_sections(lines, "tendons"), offsets, strict=False))
     for section, offset in sorted(edits, key=lambda edit: -edit[0].start):
@@ -86,7 +93,10 @@ def calibrated_text(text: str, mass_per_length: float, stiffness_factor: float, 
         if stiffness_factor != 1:
             for key in STIFFNESS_KEYS:
                 _with_numbers(lines, _key_lines(lines, section, key), lambda value: stiffness_factor * value)
-        _put(lines, section, "mass_per_length", mass_per_length)
+        if mass_factor is not None:
+            _with_numbers(lines, _key_lines(lines, section, "mass_per_length"), lambda value: mass_factor * value)
+        elif section in rods:
+            _put(lines, section, "mass_per_length", mass_per_length)
     return "".join(lines)
 
 
@@ -94,16 +104,22 @@ def _same(a: Robot, b: Robot) -> bool:
     """Whether two robots are the same to SAME."""
 
     def close(x: torch.Tensor, y: torch.Tensor) -> bool:
-        return x.shape == y.shape and torch.allclose(x, y, rtol=SAME, atol=0)
+        return x.shape == y.shape and torch.allclose(x, y, rtol=SAME, atol=SAME * float(y.abs().max()) if y.numel() else 0)
 
-    pairs = [(getattr(a.rod, key), getattr(b.rod, key)) for key in ("K_se", "K_bt", "mass_per_length", "reference_curvature")]
+    rods = [
+        (getattr(a.rod, key), getattr(b.rod, key)) for key in ("K_se", "K_bt", "mass_per_length", "reference_curvature", "masses")
+    ]
+    if (a.rod.pieces is None) != (b.rod.pieces is None):
+        return False
+    if a.rod.pieces is not None and b.rod.pieces is not None:
+        rods += [(getattr(a.rod.pieces, f.name), getattr(b.rod.pieces, f.name)) for f in fields(a.rod.pieces)]
     tendons = len(a.tendons) == len(b.tendons) and all(
         t.routing == u.routing
-        and t.ends_at == u.ends_at
+        and (t.ends_at, t.friction, t.motion) == (u.ends_at, u.friction, u.motion)
         and abs(t.tension_offset - u.tension_offset) <= SAME * abs(t.tension_offset) + 1e-300
         for t, u in zip(a.tendons.tendons, b.tendons.tendons, strict=True)
     )
-    return a.rod.length == b.rod.length and tendons and all(close(x, y) for x, y in [*pairs, (a.gravity, b.gravity)])
+    return a.rod.length == b.rod.length and tendons and all(close(x, y) for x, y in [*rods, (a.gravity, b.gravity)])
 
 
 def write_calibrated(
@@ -121,16 +137,23 @@ def write_calibrated(
     with reading(source):
         text = Path(source).read_bytes().decode("utf-8")
     offsets = tuple(t.tension_offset for t in robot.tendons.tendons) if tension_offset else None
-    text = calibrated_text(text, float(robot.rod.mass_per_length), stiffness_factor, offsets)
+    mass = float(robot.rod.mass_per_length)
+    before = float(_read(text).rod.mass_per_length) if robot.rod.pieces is not None else 0.0
+    text = calibrated_text(text, mass, stiffness_factor, offsets, mass / before if before else None)
     if not _reads_as(text, robot):
-        raise InputError(f"{path}: not written; {source} must be plain tables, [rod] and [[tendons]] with one key = value per line")
+        tables = "[rod], [[rod.sections]] and [[tendons]]"
+        raise InputError(f"{path}: not written; {source} must be plain tables, {tables} with one key = value per line")
     put_text(path, text)
+
+
+def _read(text: str) -> Robot:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the source has raised them already
+        return robot_of(Path(), tomllib.loads(text))
 
 
 def _reads_as(text: str, robot: Robot) -> bool:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the source has raised them already
-            return _same(robot, robot_of(Path(), tomllib.loads(text)))
+        return _same(robot, _read(text))
     except ValueError:  # not TOML, or not a robot (InputError)
         return False

@@ -42,9 +42,10 @@ class CKnown(ctypes.Structure):
     """The robot on its grid."""
 
     _fields_ = [
-        *((n, _I) for n in ("steps", "tendons", "newton", "diagonal")),
-        *((n, _P) for n in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")),
-        *((n, CTable) for n in ("h", "Gm", "Wn", "Wm", "u_star", "L", "dr", "tau")),
+        *((n, _I) for n in ("steps", "tendons", "newton", "diagonal", "varying")),
+        *((n, CTable) for n in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")),
+        *((n, CTable) for n in ("h", "Gm", "Wn", "Wm", "u_star", "L", "dr", "tau", "ddr")),
+        ("friction", _P),
         ("at", CPlaces),
         ("outputs", _I),
     ]
@@ -199,7 +200,8 @@ def available() -> bool:
 
 # Tensors that may have a row per sample, and their dimensions when they have none.
 SHARED_DIMENSIONS = {
-    **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "tau": 3},
+    **{"K_se": 4, "K_bt": 4, "K_se_inverse": 4, "K_bt_inverse": 4},
+    **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "ddr": 4, "tau": 3},
     **{"at": 1, "s": 2, "inside": 2, "node": 1, "weight": 1, "active": 3, "mean": 1, "precision": 1},
 }
 # What the kernel reads and writes at an address: double, but for these.
@@ -282,10 +284,10 @@ def march_linearized(
     numbers: dict[str, int],
     local: Float[Tensor, "B S 3 6"] | None,
     dlocal: Float[Tensor, "B S 3 6 g"] | None,
-    y0: Float[Tensor, "B 13"],
-    dy0: Float[Tensor, "B 13 n"],
+    y0: Float[Tensor, "B c"],
+    dy0: Float[Tensor, "B c n"],
     reverse: bool,
-) -> tuple[Float[Tensor, "B P 13"], Float[Tensor, "B P 13 n"]]:
+) -> tuple[Float[Tensor, "B P c"], Float[Tensor, "B P c n"]]:
     """States at the kept nodes and their tangents; the first g tangents also move the local loads by dlocal.
 
     tensors, numbers: those of struct Known by name (mechanics.integrate.known). local: [G, G2] at the stages.
@@ -297,7 +299,8 @@ def march_linearized(
     if local is not None:
         tensors["local"] = local.contiguous()
         tensors["dlocal"] = y0.new_zeros(*local.shape, 0) if dlocal is None else dlocal.contiguous()
-    out, dout = y0.new_empty(B, P, 13), y0.new_empty(B, P, 13, n)
+    width = y0.shape[1]
+    out, dout = y0.new_empty(B, P, width), y0.new_empty(B, P, width, n)
     tensors |= {"y0": y0.contiguous(), "dy0": dy0.contiguous(), "out": out, "dout": dout}
     counts = {"batch": B, "tangents": n, "load_tangents": 0 if dlocal is None else dlocal.shape[-1], "reverse": int(reverse)}
     call = CMarch()

@@ -44,19 +44,20 @@ void torchrod_march(const March* m, int64_t threads) {
                 }
             group.local = room.local.data();
         }
-        V y[STATE];
-        room.tangents.resize(n * STATE);
-        for (int c = 0; c < STATE; c++) {
-            y[c] = fetch({m->y0, STATE}, lanes, c);
-            for (int64_t j = 0; j < n; j++) room.tangents[j * STATE + c] = fetch({m->dy0, STATE * n}, lanes, c * n + j);
+        const int64_t width = known.width();
+        V y[MOST_STATE];
+        room.tangents.resize(n * width);
+        for (int64_t c = 0; c < width; c++) {
+            y[c] = fetch({m->y0, width}, lanes, c);
+            for (int64_t j = 0; j < n; j++) room.tangents[j * width + c] = fetch({m->dy0, width * n}, lanes, c * n + j);
         }
         walk(group, y, room.tangents.data(), m->reverse, [&](int64_t p, Mask here) {
             for (int64_t l = 0; l < lanes.count; l++) {
                 if (!here[l]) continue;
-                const int64_t to = (lanes.sample[l] * known.outputs + p) * STATE;
-                for (int c = 0; c < STATE; c++) {
+                const int64_t to = (lanes.sample[l] * known.outputs + p) * width;
+                for (int64_t c = 0; c < width; c++) {
                     m->out[to + c] = y[c][l];
-                    for (int64_t j = 0; j < n; j++) m->dout[(to + c) * n + j] = room.tangents[j * STATE + c][l];
+                    for (int64_t j = 0; j < n; j++) m->dout[(to + c) * n + j] = room.tangents[j * width + c][l];
                 }
             }
         });

@@ -8,27 +8,37 @@
 // What rk4_step leaves for its tangents: every evaluation's slope and value, the state before q is made a unit again.
 struct Trace {
     Slope slope[4];
-    V k[4][STATE], unscaled[4], h, inverse;
+    V k[4][MOST_STATE], unscaled[4], h, inverse;
     int64_t row[4];
+    Stiffness K[3];  // at the stages in the order of the walk; the first where it does not vary
 };
 
 // section.py, rk4_step: step i of the values.
 inline void rk4_step(const Group& g, V* y, int64_t i, bool reverse, Trace& t) {
     const Known& m = *g.known;
     Stage stage;
-    V z[STATE];
+    V z[MOST_STATE];
+    const int64_t width = m.width();
     t.h = fetch(m.h, g.lanes, i);
     if (reverse) t.h = -t.h;
     const int64_t order[4] = {reverse ? 2 : 0, 1, 1, reverse ? 0 : 2};
     for (int c = 0; c < STATE; c++) z[c] = y[c];
+    for (int64_t c = STATE; c < width; c++) z[c] = y[c];
     for (int e = 0; e < 4; e++) {
         t.row[e] = 3 * i + order[e];
         if (e != 2) stage_of(g, t.row[e], stage);  // the middle serves twice
+        const int64_t section = m.varying ? (e + 1) / 2 : 0;
+        if (m.varying && e != 2) stiffness_of(m, g.lanes, t.row[e], t.K[section]);
+        t.slope[e].K = &t.K[section];
         derivative(m, z, stage, t.k[e], t.slope[e]);
-        if (e < 3)
-            for (int c = 0; c < STATE; c++) z[c] = y[c] + (e < 2 ? 0.5 : 1.0) * t.h * t.k[e][c];
+        if (e == 3) break;
+        const V reach = (e < 2 ? 0.5 : 1.0) * t.h;
+        for (int c = 0; c < STATE; c++) z[c] = y[c] + reach * t.k[e][c];
+        for (int64_t c = STATE; c < width; c++) z[c] = y[c] + reach * t.k[e][c];
     }
-    for (int c = 0; c < STATE; c++) y[c] += t.h * (1.0 / 6) * (t.k[0][c] + 2.0 * (t.k[1][c] + t.k[2][c]) + t.k[3][c]);
+    auto add = [&](int64_t c) { y[c] += t.h * (1.0 / 6) * (t.k[0][c] + 2.0 * (t.k[1][c] + t.k[2][c]) + t.k[3][c]); };
+    for (int c = 0; c < STATE; c++) add(c);
+    for (int64_t c = STATE; c < width; c++) add(c);
     V square = V{};
     for (int c = 0; c < 4; c++) t.unscaled[c] = y[3 + c], square += y[3 + c] * y[3 + c];
     t.inverse = 1.0 / root(square);
@@ -36,14 +46,17 @@ inline void rk4_step(const Group& g, V* y, int64_t i, bool reverse, Trace& t) {
 }
 
 // And of tangent j, dy.
-template <bool Plain, bool Moving> __attribute__((noinline)) void rk4_tangent(const Group& g, const Trace& t, int64_t j, V* dy) {
+template <bool Plain, bool Moving, bool Rubbing> __attribute__((noinline)) void rk4_tangent(const Group& g, const Trace& t, int64_t j, V* dy) {
     const Known& m = *g.known;
-    V z[STATE], sum[STATE], dk[STATE], dh = V{};
+    constexpr int room = Rubbing ? MOST_STATE : STATE;
+    const int64_t width = Rubbing ? m.width() : STATE;
+    V z[room], sum[room], dk[room], dh = V{};
     const bool moved = Moving && j < g.load_tangents;
     auto node = [&](int64_t n) { return g.node_moves[n * g.load_tangents + j]; };
     const int64_t i = t.row[1] / 3;
     if (moved) dh = node(i + 1) - node(i);
     for (int c = 0; c < STATE; c++) z[c] = dy[c], sum[c] = V{};
+    for (int64_t c = STATE; c < width; c++) z[c] = dy[c], sum[c] = V{};
     for (int e = 0; e < 4; e++) {
         Moves moves{g.local_slope(t.row[e], j), nullptr, -1};
         V3 dWn;
@@ -55,18 +68,22 @@ template <bool Plain, bool Moving> __attribute__((noinline)) void rk4_tangent(co
             moves.Wn = &dWn;
         }
         if (j >= g.load_tangents && j < g.load_tangents + g.tension_tangents) moves.tension = j - g.load_tangents;
-        slope<Plain>(m, t.slope[e], z, moves, dk);
+        slope<Plain, Rubbing>(m, t.slope[e], z, moves, dk);
         const double weight = e == 0 || e == 3 ? 1 : 2, reach = e < 2 ? 0.5 : 1;
-        for (int c = 0; c < STATE; c++) {
+        auto go = [&](int64_t c) {
             sum[c] += weight * dk[c];
             if (e < 3) z[c] = dy[c] + reach * t.h * dk[c];
             if (moved && e < 3) z[c] += reach * dh * t.k[e][c];
-        }
+        };
+        for (int c = 0; c < STATE; c++) go(c);
+        for (int64_t c = STATE; c < width; c++) go(c);
     }
-    for (int c = 0; c < STATE; c++) {
+    auto add = [&](int64_t c) {
         dy[c] += t.h * (1.0 / 6) * sum[c];
         if (moved) dy[c] += dh * (1.0 / 6) * (t.k[0][c] + 2.0 * (t.k[1][c] + t.k[2][c]) + t.k[3][c]);
-    }
+    };
+    for (int c = 0; c < STATE; c++) add(c);
+    for (int64_t c = STATE; c < width; c++) add(c);
     V along = V{};  // of q / |q|
     for (int c = 0; c < 4; c++) along += t.unscaled[c] * dy[3 + c];
     along *= t.inverse * t.inverse;
@@ -98,7 +115,7 @@ template <class Arrive> void walk_in_own_frame(const Group& g, V* y, V* dy, bool
     }
 }
 
-// From y at one end to the other, with dy (tangents, STATE). sink(p, mask) is told of every output p as the lanes of `mask` arrive at
+// From y at one end to the other, with dy (tangents, width). sink(p, mask) is told of every output p as the lanes of `mask` arrive at
 // its node.
 template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink sink) {
     const Known& m = *g.known;
@@ -116,15 +133,18 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
     if (g.in_own_frame()) return walk_in_own_frame(g, y, dy, reverse, arrive);
     const bool plain = !m.tendons && !m.Wn.data && !m.Wm.data;
     static thread_local Trace trace;
+    if (!m.varying) stiffness_of(m, g.lanes, 0, trace.K[0]);
     arrive(reverse ? m.steps : 0, [] {});
     for (int64_t n = 0; n < m.steps; n++) {
         const int64_t i = reverse ? m.steps - 1 - n : n;
         rk4_step(g, y, i, reverse, trace);
         for (int64_t j = 0; j < g.tangents; j++) {
-            V* tangent = dy + j * STATE;
-            if (g.node_moves) rk4_tangent<false, true>(g, trace, j, tangent);
-            else if (plain) rk4_tangent<true, false>(g, trace, j, tangent);
-            else rk4_tangent<false, false>(g, trace, j, tangent);
+            V* tangent = dy + j * m.width();
+            if (m.friction && g.node_moves) rk4_tangent<false, true, true>(g, trace, j, tangent);
+            else if (m.friction) rk4_tangent<false, false, true>(g, trace, j, tangent);
+            else if (g.node_moves) rk4_tangent<false, true, false>(g, trace, j, tangent);
+            else if (plain) rk4_tangent<true, false, false>(g, trace, j, tangent);
+            else rk4_tangent<false, false, false>(g, trace, j, tangent);
         }
         arrive(reverse ? i : i + 1, [] {});
     }
@@ -134,7 +154,7 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
 struct March {
     Known known;
     int64_t batch, tangents, load_tangents, reverse;
-    const double *y0, *dy0;        // (B, 13), (B, 13, n)
+    const double *y0, *dy0;        // (B, width), (B, width, n)
     const double *local, *dlocal;  // (B, S, 3, 6) = [G, G2], (B, S, 3, 6, load_tangents), or null
-    double *out, *dout;            // (B, P, 13), (B, P, 13, n)
+    double *out, *dout;            // (B, P, width), (B, P, width, n)
 };

@@ -45,7 +45,7 @@ struct Balance {
 };
 
 // tendons.py, balanced_strains: the values.
-inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
+inline void balance(const Known& m, const Stiffness& K, const Stage& at, const V* tau, const V* w, Balance& b) {
     const V star[6] = {V{}, V{}, splat(1.0), at.u_star.c[0], at.u_star.c[1], at.u_star.c[2]};
     for (int i = 0; i < 6; i++) b.x[i] = star[i];
     for (int iteration = 0; iteration <= m.newton; iteration++) {
@@ -54,9 +54,9 @@ inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
         for (int i = 0; i < 3; i++) {
             misfit[i] = w[i], misfit[3 + i] = w[3 + i];
             for (int j = 0; j < 3; j++) {
-                misfit[i] -= m.K_se[3 * i + j] * (b.x[j] - star[j]);
-                misfit[3 + i] -= m.K_bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
-                J[6 * i + j] = splat(m.K_se[3 * i + j]), J[6 * (3 + i) + 3 + j] = splat(m.K_bt[3 * i + j]);
+                misfit[i] -= K.se[3 * i + j] * (b.x[j] - star[j]);
+                misfit[3 + i] -= K.bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
+                J[6 * i + j] = K.se[3 * i + j], J[6 * (3 + i) + 3 + j] = K.bt[3 * i + j];
             }
         }
         for (int64_t t = 0; t < m.tendons; t++) {
@@ -69,9 +69,9 @@ inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
             }
             V stretch = root(square);
             for (int j = 0; j < 6; j++) g[j] = (L[j] * along[0] + L[6 + j] * along[1] + L[12 + j] * along[2]) / stretch;
-            for (int j = 0; j < 6; j++) misfit[j] -= at.tau[t] * g[j];
+            for (int j = 0; j < 6; j++) misfit[j] -= tau[t] * g[j];
             if (iteration == m.newton) continue;
-            V weight = at.tau[t] / stretch;
+            V weight = tau[t] / stretch;
             for (int i = 0; i < 6; i++)
                 for (int j = 0; j < 6; j++)
                     J[6 * i + j] += weight * (L[i] * L[j] + L[6 + i] * L[6 + j] + L[12 + i] * L[12 + j] - g[i] * g[j]);
@@ -86,11 +86,35 @@ inline void balance(const Known& m, const Stage& at, const V* w, Balance& b) {
     }
 }
 
+// tendons.py, turning_rate: Theta' of tendon t, and how it moves with the strains x, (6).
+inline V turning_rate(const Stage& at, int64_t t, const V* x, V pull, double floor, V* slope) {
+    const V* L = at.L + 18 * t;
+    const V3 u = part(x + 3), dr = part(at.dr + 3 * t), change = cross(u, dr) + part(at.ddr + 3 * t);
+    V3 along = dr;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 6; j++) along.c[i] += L[6 * i + j] * x[j];
+    const V per = 1.0 / root(dot(along, along));
+    const V3 d = per * along;
+    const V ahead = dot(d, change);
+    const V3 aside = change - ahead * d, turn = cross(u, d) + per * aside;
+    const V rate = root(dot(turn, turn) + floor * floor), there = select(pull > 0, splat(1.0), V{}), per_rate = there / rate;
+    // turn is normal to d, so that only what moves d across itself counts, and what stretches `along`.
+    const V3 by_d = cross(turn, u) - (per * ahead) * turn, by_u = cross(d, turn) + per * cross(dr, turn);
+    const V3 by_along = per * (by_d - dot(d, by_d) * d) - (per * per * dot(turn, aside)) * d;
+    for (int j = 0; j < 6; j++) {
+        V sum = j < 3 ? V{} : by_u.c[j - 3];
+        for (int i = 0; i < 3; i++) sum += L[6 * i + j] * by_along.c[i];
+        slope[j] = per_rate * sum;
+    }
+    return there * rate;
+}
+
 // What the derivative of one evaluation of (1)-(4) needs of its values. Jv (3, 4): of R v by q; Jn, Jm: of R^T Wn and R^T Wm.
 struct Slope {
-    V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS];
+    V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS], tau[MOST_TENDONS], fall[MOST_TENDONS], turn[MOST_TENDONS * 6];
     V3 q, u, v, N, N_turning, M_turning;
     bool Jn_there, Jm_there;
+    const Stiffness* K;
     Balance balance;
 };
 
@@ -109,11 +133,17 @@ inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope
     if (at.Wm_there) M = M + turned(back, s.w, at.Wm), turning(s.q, s.w, -1, at.Wm, s.Jm);
     if (m.tendons) {
         const V w[6] = {s.N.c[0], s.N.c[1], s.N.c[2], M.c[0], M.c[1], M.c[2]};
-        balance(m, at, w, s.balance);
+        for (int64_t t = 0; t < m.tendons; t++) s.tau[t] = at.tau[t], s.tau_unit[t] = at.tau_unit[t];
+        for (int64_t t = 0; m.friction && t < m.tendons; t++) {
+            const V left = exponential(larger(smaller(-m.friction[t] * y[STATE + t], splat(700.0)), splat(-700.0)));
+            s.tau[t] *= left, s.tau_unit[t] *= left, s.fall[t] = m.friction[t] * s.tau[t];
+        }
+        balance(m, *s.K, at, s.tau, w, s.balance);
         s.v = part(s.balance.x), s.u = part(s.balance.x + 3);
-        for (int64_t t = 0; t < m.tendons; t++) s.tau_unit[t] = at.tau_unit[t];
+        for (int64_t t = 0; m.friction && t < m.tendons; t++)
+            dy[STATE + t] = turning_rate(at, t, s.balance.x, s.tau[t], m.friction[m.tendons], s.turn + 6 * t);
     } else {
-        s.v = matvec(m.K_se_inverse, s.N), s.u = at.u_star + matvec(m.K_bt_inverse, M);
+        s.v = matvec(s.K->se, s.N), s.u = at.u_star + matvec(s.K->bt, M);
         s.v.c[2] += 1.0;
     }
     for (int k = 0; k < 3; k++) {
@@ -139,7 +169,8 @@ struct Moves {
 };
 
 // The derivative of `derivative` along one tangent z of the state. Plain: no tendons and no loads of the base frame.
-template <bool Plain> INLINE void slope(const Known& m, const Slope& s, const V* z, const Moves& moves, V* dk) {
+// Rubbing: tendons with friction, whose Theta come behind the rest of the state.
+template <bool Plain, bool Rubbing> INLINE void slope(const Known& m, const Slope& s, const V* z, const Moves& moves, V* dk) {
     V3 dNt = part(z + 7), dMt = part(z + 10), shear{};
     if (moves.local) {
         const V* l = moves.local;
@@ -157,15 +188,24 @@ template <bool Plain> INLINE void slope(const Known& m, const Slope& s, const V*
         V dw[6] = {dN.c[0], dN.c[1], dN.c[2], dM.c[0], dM.c[1], dM.c[2]}, dx[6];
         if (moves.tension >= 0)
             for (int i = 0; i < 6; i++) dw[i] -= s.tau_unit[moves.tension] * s.balance.g[6 * moves.tension + i];
+        for (int64_t t = 0; Rubbing && t < m.tendons; t++) {
+            const V less = s.fall[t] * z[STATE + t];
+            for (int i = 0; i < 6; i++) dw[i] += less * s.balance.g[6 * t + i];
+        }
         for (int i = 0; i < 6; i++) {
             dx[i] = V{};
             for (int k = 0; k < 6; k++) dx[i] += s.balance.inverse[6 * i + k] * dw[k];
         }
         dv = part(dx), du = part(dx + 3);
+        for (int64_t t = 0; Rubbing && t < m.tendons; t++) {
+            V rate = V{};
+            for (int i = 0; i < 6; i++) rate += s.turn[6 * t + i] * dx[i];
+            dk[STATE + t] = rate;
+        }
     } else if (m.diagonal) {
-        for (int i = 0; i < 3; i++) dv.c[i] = m.K_se_inverse[4 * i] * dN.c[i], du.c[i] = m.K_bt_inverse[4 * i] * dM.c[i];
+        for (int i = 0; i < 3; i++) dv.c[i] = s.K->se[4 * i] * dN.c[i], du.c[i] = s.K->bt[4 * i] * dM.c[i];
     } else {
-        dv = matvec(m.K_se_inverse, dN), du = matvec(m.K_bt_inverse, dM);
+        dv = matvec(s.K->se, dN), du = matvec(s.K->bt, dM);
     }
     const V3 dq = part(z + 3), p = matvec(s.R, dv) + matvec4(s.Jv, z + 3), q = s.w * du + z[6] * s.u + cross(dq, s.u) + cross(s.q, du),
              N = cross(dNt, s.u) + cross(s.N_turning, du),

@@ -72,7 +72,7 @@ struct Stages {
     Quaternion e[4];
 };
 
-INLINE void body_stages(const Group& g, V* y, const int64_t* row, V h, const V3& S, const V3& B, Stages& s) {
+INLINE void body_stages(const Group& g, V* y, const int64_t* row, V h, const V3* S, const V3* B, Stages& s) {
     Stage at;
     V z[6], sum[6];
     for (int c = 0; c < 6; c++) z[c] = y[7 + c], sum[c] = V{};
@@ -82,8 +82,8 @@ INLINE void body_stages(const Group& g, V* y, const int64_t* row, V h, const V3&
         s.M[i] = part(z + 3) - at.Gm;
         s.M[i].c[0] -= at.G2y, s.M[i].c[1] += at.G2x;
         for (int k = 0; k < 3; k++) {
-            s.v[i].c[k] = S.c[k] * s.N[i].c[k] + (k == 2 ? 1.0 : 0.0);
-            s.u[i].c[k] = B.c[k] * s.M[i].c[k] + at.u_star.c[k];
+            s.v[i].c[k] = S[i].c[k] * s.N[i].c[k] + (k == 2 ? 1.0 : 0.0);
+            s.u[i].c[k] = B[i].c[k] * s.M[i].c[k] + at.u_star.c[k];
         }
         const V3 dN = cross(s.N[i], s.u[i]);
         V3 dM = cross(s.M[i], s.u[i]) + cross(s.N[i], s.v[i]);
@@ -103,8 +103,15 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
     const Known& m = *g.known;
     const V h = (reverse ? -1.0 : 1.0) * fetch(m.h, g.lanes, i);
     const int64_t first = reverse ? 2 : 0, row[4] = {3 * i + first, 3 * i + 1, 3 * i + 1, 3 * i + 2 - first};
-    V3 S, B;
-    for (int k = 0; k < 3; k++) S.c[k] = splat(m.K_se_inverse[4 * k]), B.c[k] = splat(m.K_bt_inverse[4 * k]);
+    V3 S[4], B[4];
+    for (int e = 0; e < 4; e++) {
+        const bool again = e == 2 || (e && !m.varying);
+        for (int k = 0; k < 3; k++) {
+            const int64_t at = 4 * k + (m.varying ? 9 * row[e] : 0);
+            S[e].c[k] = again ? S[e - 1].c[k] : fetch(m.K_se_inverse, g.lanes, at);
+            B[e].c[k] = again ? B[e - 1].c[k] : fetch(m.K_bt_inverse, g.lanes, at);
+        }
+    }
     Stages s;
     body_stages(g, y, row, h, S, B, s);
     const V half = 0.5 * h, quarter = 0.25 * h, sixth = (1.0 / 6) * h, one = splat(1.0);
@@ -137,11 +144,11 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
     for (int k = 0; k < 4; k++) {
         BodyStep::Stage& at = b.at[k];
         at.row = row[k], at.share = k < 2 ? half : k == 2 ? h : sixth;
-        skewed(at.share, s.u[k], V3{}, V3{}, at.NN), skewed(at.share, V3{}, s.N[k], B, at.NM);
-        skewed(at.share, s.v[k], s.N[k], S, at.MN), skewed(at.share, s.u[k], s.M[k], B, at.MM);
-        between(back * s.e[k], g_[k], B, at.C), between(s.e[k], b_[k], B, at.D);
+        skewed(at.share, s.u[k], V3{}, V3{}, at.NN), skewed(at.share, V3{}, s.N[k], B[k], at.NM);
+        skewed(at.share, s.v[k], s.N[k], S[k], at.MN), skewed(at.share, s.u[k], s.M[k], B[k], at.MM);
+        between(back * s.e[k], g_[k], B[k], at.C), between(s.e[k], b_[k], B[k], at.D);
         const V weight = (k == 1 || k == 2 ? 2.0 : 1.0) * sixth;
-        between(s.e[k], conjugate(s.e[k]), weight * S, at.F);
+        between(s.e[k], conjugate(s.e[k]), weight * S[k], at.F);
     }
     between(conjugate(turn), turn, V3{one, one, one}, b.Q);
 }

@@ -123,7 +123,7 @@ template <class X> struct Show {
             turning(q, y[6], 1, offset, J);
         }
         for (int64_t j = 0; j < g.tangents; j++) {
-            const V* d = dy + j * STATE;
+            const V* d = dy + j * f.known.width();
             V3 dr = part(d);
             if (f.offsets) dr = dr + matvec4(J, d + 3);
             put(here, 3 * p, column(j), f.registration ? matvec(motion.R, dr) : dr);
@@ -157,7 +157,7 @@ template <class X> struct Show {
             if (free) c = c - turned(back, y[6], unknown), turning(q, y[6], -1, unknown, J);
             put(here, z, c);
             for (int64_t j = 0; j < g.tangents; j++) {
-                const V *d = dy + j * STATE, *dl = g.local_slope(3 * f.known.steps, j);
+                const V *d = dy + j * f.known.width(), *dl = g.local_slope(3 * f.known.steps, j);
                 V3 dc = part(d + 7 + 3 * half);
                 if (dl) dc = dc - (half ? V3{dl[4], -dl[3], V{}} : part(dl));
                 if (free) dc = dc - matvec4(J, d + 3);
@@ -185,14 +185,15 @@ template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool
         }
         motion = Motion(translation, turn);
     }
-    V y[STATE] = {};
+    V y[MOST_STATE] = {};
     y[6] = splat(1.0);
-    room.tangents.assign(g.tangents * STATE, V{});
+    const int64_t stride = m.width();
+    room.tangents.assign(g.tangents * stride, V{});
     for (int i = 0; i < 6; i++) {
         const double unit = i < 3 ? f.force_unit : f.moment_unit;
         y[7 + i] = unit * x(n - PLAIN + i);
         if (i < 3 && m.Wn.data) y[7 + i] -= fetch(m.Wn, g.lanes, i);
-        if (slopes) room.tangents[(fixed + i) * STATE + 7 + i] = splat(unit);
+        if (slopes) room.tangents[(fixed + i) * stride + 7 + i] = splat(unit);
     }
     const Show<X> show{f, g, x, motion, to, y, room.tangents.data()};
     walk(g, y, room.tangents.data(), false, [&](int64_t p, Mask here) {

@@ -5,7 +5,7 @@
 #include "simd.h"
 
 constexpr int MOST_TENDONS = 16;
-constexpr int STATE = 13, PARTS = 5;  // of the state p, q, N~, M~; of a local load: G_x, G_y, G_z, G2_x, G2_y
+constexpr int STATE = 13, MOST_STATE = STATE + MOST_TENDONS, PARTS = 5;  // of the state p, q, N~, M~, with Theta; of a local load: G_x, G_y, G_z, G2_x, G2_y
 
 struct Table {  // null where there is none; stride 0: shared, else numbers per sample
     const double* data;
@@ -18,13 +18,17 @@ struct Places {  // integers, likewise
 };
 
 struct Known {
-    int64_t steps, tendons, newton, diagonal;
-    const double *K_se, *K_bt, *K_se_inverse, *K_bt_inverse;  // 9 each
-    Table h;                                                  // (S)
-    Table Gm, Wn, Wm, u_star;                                 // (S, 3, 3)
-    Table L, dr, tau;                                         // (S, 3, T, 18), (S, 3, T, 3), (S, 3, T)
-    Places at;                                                // (P) nodes of the outputs
+    int64_t steps, tendons, newton, diagonal, varying;
+    Table K_se, K_bt, K_se_inverse, K_bt_inverse;  // (9); where the section varies, (S, 3, 9)
+    Table h;                                       // (S)
+    Table Gm, Wn, Wm, u_star;                      // (S, 3, 3)
+    Table L, dr, tau;                              // (S, 3, T, 18), (S, 3, T, 3), (S, 3, T)
+    Table ddr;                                     // (S, 3, T, 3), where tendons rub
+    const double* friction;                        // (T + 1): of every tendon, and the floor of their turning; or null
+    Places at;                                     // (P) nodes of the outputs
     int64_t outputs;
+
+    int64_t width() const { return STATE + (friction ? tendons : 0); }  // of the state: with Theta of every tendon where they rub
 };
 
 // The samples in the lanes; lanes beyond `count` repeat the first sample and are not stored.
@@ -49,11 +53,21 @@ INLINE bool any(Mask m) {
     return r != 0;
 }
 
+// A section's stiffness: with tendons K_se and K_bt, without their inverses.
+struct Stiffness {
+    V se[9], bt[9];
+};
+inline void stiffness_of(const Known& m, const Lanes& lanes, int64_t row, Stiffness& K) {
+    const int64_t at = m.varying ? 9 * row : 0;
+    const Table &se = m.tendons ? m.K_se : m.K_se_inverse, &bt = m.tendons ? m.K_bt : m.K_bt_inverse;
+    for (int64_t x = 0; x < 9; x++) K.se[x] = fetch(se, lanes, at + x), K.bt[x] = fetch(bt, lanes, at + x);
+}
+
 // All that is known at one stage, for the samples in the lanes.
 struct Stage {
     bool Wn_there, Wm_there;
     V3 G, Gm, Wn, Wm, u_star;
-    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
+    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], ddr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
 };
 
 // One group of samples. Tangents are ordered [loads | tensions | the rest]; only the first two move what is known along the rod.
@@ -93,6 +107,7 @@ inline void stage_of(const Group& g, int64_t row, Stage& s) {
     }
     for (int64_t x = 0; x < 18 * m.tendons; x++) s.L[x] = fetch(m.L, g.lanes, row * 18 * m.tendons + x);
     for (int64_t x = 0; x < 3 * m.tendons; x++) s.dr[x] = fetch(m.dr, g.lanes, row * 3 * m.tendons + x);
+    for (int64_t x = 0; m.friction && x < 3 * m.tendons; x++) s.ddr[x] = fetch(m.ddr, g.lanes, row * 3 * m.tendons + x);
     for (int64_t t = 0; t < m.tendons; t++) {
         s.tau[t] = fetch(m.tau, g.lanes, row * m.tendons + t);
         s.tau_unit[t] = V{};

@@ -161,6 +161,10 @@ def _robot_misfit(card: dict[str, Any], problem: Problem) -> str | None:
     least, most = card["tendons"]
     if card["active"] and len(robot.tendons) > most:
         return f"it was trained with {least} to {most} tendons, and the robot has {len(robot.tendons)}"
+    if rod.pieces is not None or len(rod.masses):
+        return "it knows rods of one section without masses on them only"
+    if robot.tendons.friction is not None:
+        return "it knows tendons without friction only"
     if not _round_and_straight(rod):
         return "it knows straight rods that bend alike in all directions only"
     ratios = {

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..util.precision import DTYPE, Float64
 from .lie import Vector
-from .loads import LoadIntegrals
+from .loads import LoadIntegrals, PointWrenches
 from .rod import Rod
 from .tendons import Tendons
 
@@ -32,16 +32,25 @@ class Robot(Float64):
 
     @property
     def weight(self) -> Vector:
-        """Gravity force per length (..., 3), N/m, base frame."""
+        """Gravity force per length (..., 3), N/m, base frame, without what hangs at points: the mean where it varies."""
         return self.rod.mass_per_length.unsqueeze(-1) * self.gravity
 
     @property
     def weightless(self) -> bool:
         """True where gravity plays no part."""
-        return not bool((self.weight != 0).any())
+        return not bool((self.weight != 0).any() | (self.rod.masses[:, 1:] * self.gravity[..., None, :] != 0).any())
 
-    def weight_beyond(self, s: Float[Tensor, "... S 3"]) -> LoadIntegrals:
-        """Wn(s) = rho g (L - s) (N, base frame): the weight that hangs beyond s."""
+    @property
+    def point_weights(self) -> PointWrenches:
+        """What the masses on the rod pull (..., K, 3), N, base frame."""
+        force = self.rod.masses[:, 1:] * self.gravity[..., None, :]
+        return PointWrenches(force, torch.zeros_like(force), self.rod.masses[:, 0])
+
+    def weight_beyond(self, s: Float[Tensor, "... S 3"], inside: Float[Tensor, "... S 3"]) -> LoadIntegrals:
+        """Wn(s) (N, base frame): the weight that hangs beyond s, rho g (L - s) where the rod is uniform."""
         if self.weightless:
             return LoadIntegrals()
-        return LoadIntegrals(Wn=self.weight[..., None, None, :] * (self.rod.length - s).unsqueeze(-1))
+        rod = LoadIntegrals(Wn=self.weight[..., None, None, :] * self.rod.length_beyond(s, inside).unsqueeze(-1))
+        if not len(self.rod.masses):
+            return rod
+        return rod + LoadIntegrals(Wn=self.point_weights.integrals(s, inside).Wn)

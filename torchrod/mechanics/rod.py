@@ -1,7 +1,7 @@
 """The elastic rod: length, section stiffness, mass and reference curvature."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..util.precision import DTYPE, Float64, plain
 from .lie import Matrix
+from .pieces import Piece, Pieces, joined
 
 SYMMETRIC = 1e-6  # relative: what the numbers of a file may be off
 
@@ -27,12 +28,14 @@ def check_stiffness(name: str, K: Tensor, unit: str) -> None:
 
 @dataclass(frozen=True)
 class Rod(Float64):
-    """A straight or pre-curved rod of uniform section, clamped at s = 0, leaving the base frame along +z.
+    """A straight or pre-curved rod, clamped at s = 0, leaving the base frame along +z.
 
     Constitutive law in the section frame: n = K_se (v - e3), m = K_bt (u - u*). length: L (m). K_se: shear and axial stiffness (3,
     3), N. K_bt: bending and torsion stiffness (3, 3), N m^2. mass_per_length: kg/m. reference_curvature: rows [s, u*_x, u*_y, u*_z]
-    (m, 1/m), s not falling: linear in between, constant beyond, a jump where two rows have the same s. One row is constant. One rod
-    serves the whole batch. Errors: ValueError for what is no rod. Source: Rucker & Webster 2011, eq. (4)-(6).
+    (m, 1/m), s not falling: linear in between, constant beyond, a jump where two rows have the same s. One row is constant.
+    pieces: how K_se, K_bt and mass_per_length, which then are means, vary along the rod (`Rod.of_pieces`); None: they do not.
+    masses: rows [s, m] (m, kg) of what hangs on the rod at a point: discs, sensors, a camera at the tip. One rod serves the whole
+    batch. Errors: ValueError for what is no rod. Source: Rucker & Webster 2011, eq. (4)-(6).
     """
 
     length: float
@@ -40,6 +43,8 @@ class Rod(Float64):
     K_bt: Float[Tensor, "3 3"]
     mass_per_length: Float[Tensor, ""]
     reference_curvature: Float[Tensor, "rows 4"]
+    pieces: Pieces | None = None
+    masses: Float[Tensor, "points 2"] = field(default_factory=lambda: torch.zeros(0, 2, dtype=DTYPE))
 
     def __post_init__(self):
         super().__post_init__()
@@ -57,6 +62,15 @@ class Rod(Float64):
             raise ValueError("reference_curvature must be finite, in m and 1/m")
         if plain(rows) and bool((rows[:, 0].diff() < 0).any()):
             raise ValueError("reference_curvature: s must increase from row to row")
+        if self.pieces is not None and abs(float(self.pieces.ends[-1]) - self.length) > SYMMETRIC * self.length:
+            raise ValueError(f"the pieces end at {float(self.pieces.ends[-1])} m; the last must end at the length, {self.length} m")
+        points = self.masses
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise ValueError(f"masses has shape {tuple(points.shape)}; it must be rows of [s (m), mass (kg)]")
+        if plain(points) and len(points):
+            s, m = points.detach().unbind(-1)
+            if not bool((torch.isfinite(m) & (m >= 0) & (s >= 0) & (s <= self.length * (1 + SYMMETRIC))).all()):
+                raise ValueError(f"masses must be at least 0 kg and finite, at 0 to {self.length} m")
 
     @classmethod
     def circular(
@@ -92,9 +106,25 @@ class Rod(Float64):
             reference_curvature = torch.zeros(1, 4, dtype=DTYPE)
         return cls(length, K_se, K_bt, torch.as_tensor(mass_per_length, dtype=DTYPE), reference_curvature)
 
+    @classmethod
+    def of_pieces(
+        cls,
+        pieces: tuple[Piece, ...],
+        reference_curvature: Float[Tensor, "rows 4"] | None = None,
+        masses: Float[Tensor, "points 2"] | None = None,
+    ) -> "Rod":
+        """A rod whose section varies: one piece after the other, from the base to the tip (mechanics.pieces)."""
+        K_se, K_bt, mass, varying = joined(pieces)
+        rod = cls.from_stiffness(pieces[-1].to, K_se, K_bt, 0.0, reference_curvature)
+        masses = rod.masses if masses is None else masses
+        return replace(rod, mass_per_length=mass, pieces=varying, masses=masses)
+
     @property
     def bending_stiffness(self) -> float:
-        """EI (N m^2): the geometric mean of the two bending stiffnesses, the rod's scale of stiffness."""
+        """EI (N m^2): the geometric mean of the two bending stiffnesses, the rod's scale of stiffness.
+
+        Of a rod whose section varies: of a uniform one whose tip yields as far to a force there.
+        """
         return float((self.K_bt[0, 0] * self.K_bt[1, 1]).detach().sqrt())
 
     @property
@@ -109,19 +139,35 @@ class Rod(Float64):
 
     @property
     def softest(self) -> float:
-        """The least of the three stiffnesses in bending and torsion (N m^2)."""
-        return float(torch.linalg.eigvalsh(self.K_bt.detach())[0])
+        """The least of the three stiffnesses in bending and torsion (N m^2), anywhere on the rod."""
+        return float(torch.linalg.eigvalsh(self.sampled_stiffness[1].detach())[..., 0].min())
+
+    @property
+    def sampled_stiffness(self) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3 3"]]:
+        """K_se and K_bt, at places all along where they vary."""
+        return (self.K_se, self.K_bt) if self.pieces is None else self.pieces.sampled(self.K_se, self.K_bt)
+
+    @property
+    def mass(self) -> float:
+        """All of it (kg)."""
+        return float(self.mass_per_length) * self.length + float(self.masses[:, 1].sum())
 
     @property
     def knots(self) -> tuple[float, ...]:
-        """Arc lengths (m) on the rod at which u* jumps or bends: step boundaries of the integration."""
-        rows = self.reference_curvature
-        return tuple(s for s in rows[:, 0].tolist() if 0 < s < self.length) if len(rows) > 1 else ()
+        """Arc lengths (m) on the rod at which u* jumps or bends, a piece ends or a mass hangs: step boundaries."""
+        rows, pieces = self.reference_curvature, self.pieces
+        places = rows[:, 0].tolist() if len(rows) > 1 else []
+        places += [] if pieces is None else pieces.ends.tolist()
+        return tuple(s for s in places + self.masses[:, 0].tolist() if 0 < s < self.length)
 
     @property
     def straight(self) -> bool:
         """Whether u* is zero all along."""
         return not bool((self.reference_curvature[:, 1:] != 0).any())
+
+    def length_beyond(self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """How long a piece (m) of mass_per_length weighs as much as the rod, without the masses on it, beyond s."""
+        return self.length - s if self.pieces is None else self.pieces.length_beyond(s, inside)
 
     def curvature_at(self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."]) -> Float[Tensor, "... 3"]:
         """u*(s) (1/m), section frame; `inside` is a point of the same step and decides on which side of a jump s lies."""

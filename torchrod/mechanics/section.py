@@ -13,6 +13,8 @@ G, G2, Gm, Wn, Wm are the closed-form integrals of mechanics.loads. Then, with v
     (3)  N' = -u x N - f - R^T f_w           and (1)  give   N~' = -u x (N~ - G)
     (4)  M' = -u x M - v x N - l - R^T l_w   and (1)  give   M~' = -u x (M - R^T Wm) - v x N - e3 x G
 
+    (5)  Theta_j' = |u x t_j + t_j'|,   tau_j = tau_j(0) exp(-mu_j Theta_j)        where tendons rub (tendons.py, turning_rate)
+
 In (3) and (4) no load density is left, so a narrow Gaussian costs no accuracy, and without world-frame loads they do not see
 the orientation. Source: docs/model.md, which rewrites Rucker & Webster 2011 for the whole section.
 Everything here is pointwise in the leading dimensions and free of branches on values: it can be mapped, differentiated in
@@ -27,15 +29,20 @@ from torch import Tensor
 
 from .lie import Matrix, Vector, cross, inverse3, matvec, normalized, quaternion_rate, rotate, unrotate
 from .loads import LoadIntegrals
-from .tendons import TendonTable, balanced_strains
+from .tendons import TendonTable, balanced_strains, turning_rate
 
-State = Float[Tensor, "... 13"]
+State = Float[Tensor, "... 13"]  # with Theta of every tendon behind it where there is friction
 STATE_PARTS = [3, 4, 3, 3]
+STATE = sum(STATE_PARTS)
+MATRICES = ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")  # of a section
 
 
 @dataclass(frozen=True)
 class Section:
-    """What the section is made of: stiffnesses, their inverses and the unstretched direction e3."""
+    """What the section is made of: stiffnesses, their inverses and the unstretched direction e3.
+
+    One for the whole rod, or tensors of (..., S, 3, 3, 3) in a StageTable.
+    """
 
     K_se: Matrix
     K_bt: Matrix
@@ -56,16 +63,22 @@ class StageTable:
     loads: LoadIntegrals
     u_star: Vector
     tendons: TendonTable | None
+    section: Section | None = None  # where it varies along the rod
 
     def _map(self, function) -> "StageTable":
         def at(x: Tensor | None) -> Tensor | None:
             return None if x is None else function(x)
 
-        loads, t = self.loads, self.tendons
+        loads, t, of = self.loads, self.tendons, self.section
         return StageTable(
             LoadIntegrals(at(loads.G), at(loads.G2), at(loads.Gm), at(loads.Wn), at(loads.Wm)),
             function(self.u_star),
-            None if t is None else TendonTable(function(t.L, 3), function(t.dr, 2), function(t.tau), t.newton),
+            None
+            if t is None
+            else replace(
+                t, L=function(t.L, 3), dr=function(t.dr, 2), tau=function(t.tau), ddr=None if t.ddr is None else function(t.ddr, 2)
+            ),
+            None if of is None else replace(of, **{name: function(getattr(of, name), 2) for name in MATRICES}),
         )
 
     def step(self, i: int) -> "StageTable":
@@ -112,21 +125,25 @@ def section_wrench(q: Float[Tensor, "... 4"], N: Vector, M: Vector, e3: Vector, 
 
 
 def derivative(section: Section, y: State, at: StageTable) -> State:
-    """dy/ds by (1)-(4)."""
-    _, q, N_tilde, M_tilde = y.split(STATE_PARTS, -1)
-    loads = at.loads
+    """dy/ds by (1)-(4), and (5) where there is friction."""
+    (_, q, N_tilde, M_tilde), turned = y[..., :STATE].split(STATE_PARTS, -1), y[..., STATE:]
+    loads, section = at.loads, at.section or section
     N, M = section_wrench(q, N_tilde, M_tilde, section.e3, loads)
-    if at.tendons is None:
+    tendons = at.tendons if at.tendons is None or at.tendons.friction is None else at.tendons.after(turned)
+    if tendons is None:
         v = section.e3 + matvec(section.K_se_inverse, N)
         u = at.u_star + matvec(section.K_bt_inverse, M)
     else:
-        v, u = balanced_strains(section.K_se, section.K_bt, section.e3, at.u_star, N, M, at.tendons)
+        v, u = balanced_strains(section.K_se, section.K_bt, section.e3, at.u_star, N, M, tendons)
     N_turning, M_turning, couple = N_tilde, M, cross(v, N)
     if loads.G is not None:
         N_turning, couple = N_tilde - loads.G, couple + cross(section.e3, loads.G)
     if loads.Wm is not None:
         M_turning = M - unrotate(q, loads.Wm)
-    return torch.cat([rotate(q, v), quaternion_rate(q, u), -cross(u, N_turning), -cross(u, M_turning) - couple], -1)
+    rates = [rotate(q, v), quaternion_rate(q, u), -cross(u, N_turning), -cross(u, M_turning) - couple]
+    if tendons is not None and tendons.friction is not None:
+        rates.append(turning_rate(torch.cat([v, u], -1), tendons))
+    return torch.cat(rates, -1)
 
 
 def rk4_step(section: Section, y: State, table: StageTable, h: Float[Tensor, "..."]) -> State:
@@ -138,5 +155,4 @@ def rk4_step(section: Section, y: State, table: StageTable, h: Float[Tensor, "..
     k3 = derivative(section, y + 0.5 * h * k2, middle)
     k4 = derivative(section, y + h * k3, end)
     y = y + h / 6 * (k1 + 2 * (k2 + k3) + k4)
-    p, q, N, M = y.split(STATE_PARTS, -1)
-    return torch.cat([p, normalized(q), N, M], -1)
+    return torch.cat([y[..., :3], normalized(y[..., 3:7]), y[..., 7:]], -1)

@@ -23,10 +23,10 @@ from .integrate import march, march_linearized, states_at
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logarithm, matvec, rotate, turned
 from .loads import Load, LoadIntegrals, taken, total
 from .robot import Robot
-from .section import STATE_PARTS, Section, StageTable, State, section_wrench
+from .section import MATRICES, STATE, STATE_PARTS, Section, StageTable, State, section_wrench
 from .stability import conjugate_points, follow
 from .tendons import strains_settled
-from .tip_problem import ORIENTATION_TOLERANCE, SETTLED, TipProblem, newton, turning
+from .tip_problem import ORIENTATION_TOLERANCE, SETTLED, TipProblem, newton, newton_with_turning, turning, with_turning
 
 ROUGH_TOLERANCE = 1e-5  # rad: enough where a filter starts
 LOAD_PER_INCREMENT = 2.0  # in EI / L^2: world-frame loads beyond this are put on in increments, to stay on the principal branch
@@ -45,13 +45,14 @@ KEPT_STEPS = 256  # robots and marker layouts
 def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, "... T"] | None, grid: Grid | Places) -> StageTable:
     """All that is known along the rod, at the stages of every step of the grid. tension: (..., T) readings, N."""
     s, inside = grid.stages, grid.inside
-    integrals = total(loads, s, inside) + robot.weight_beyond(s)
+    integrals, rod = total(loads, s, inside) + robot.weight_beyond(s, inside), robot.rod
     tendons = None
     if len(robot.tendons) and tension is not None:
         tau = robot.tendons.true_tension(tension)
-        newton = robot.tendons.newton_steps(robot.rod.K_se, robot.rod.K_bt, tau)
+        newton = robot.tendons.newton_steps(*rod.sampled_stiffness, tau)
         tendons = robot.tendons.table(s, inside, tau[..., None, None, :], newton)
-    return StageTable(integrals, robot.rod.curvature_at(s, inside), tendons)
+    section = None if rod.pieces is None else Section.of(*rod.pieces.stiffness(rod.K_se, rod.K_bt, s, inside))
+    return StageTable(integrals, rod.curvature_at(s, inside), tendons, section)
 
 
 def grid_for(robot: Robot, loads: tuple[Load, ...], outputs: Float[Tensor, " P"], steps: int) -> Grid:
@@ -111,7 +112,7 @@ def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadI
 
     c = [N~ - G, M~ + e3 x G2 - Gm] at s = L+, zero in equilibrium
     """
-    p, q, N, M = states.split(STATE_PARTS, -1)
+    p, q, N, M = states[..., :STATE].split(STATE_PARTS, -1)
     c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond)
     return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :], states[..., :-1, 7:])
 
@@ -251,7 +252,8 @@ def _increments(load: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
 
 
 def _tensors(robot: Robot, loads: tuple[Load, ...], *more: Tensor | None) -> list[Tensor]:
-    values = [robot.gravity, *vars(robot.rod).values(), *(x for load in loads for x in vars(load).values()), *more]
+    pieces = () if robot.rod.pieces is None else vars(robot.rod.pieces).values()
+    values = [robot.gravity, *vars(robot.rod).values(), *pieces, *(x for load in loads for x in vars(load).values()), *more]
     return [x for x in values if isinstance(x, Tensor)]
 
 
@@ -340,11 +342,11 @@ def steps_of_rod(robot: Robot, outputs: Float[Tensor, " P"]) -> int:
 
     def work_out() -> int:
         with torch.no_grad():
-            bare = Robot(replace(rod, reference_curvature=rod.reference_curvature.detach()))
+            bare = Robot(replace(rod, reference_curvature=rod.reference_curvature.detach(), masses=rod.masses.detach()))
             answer = _solve(bare, (), None, outputs.detach(), 1, DEFAULT_STEPS, ORIENTATION_TOLERANCE, None, False)
             return _halved(bare, (), None, answer, torch.tensor([0]), DEFAULT_STEPS, ORIENTATION_TOLERANCE, False)[1]
 
-    return _steps_kept(key((rod.length, rod.reference_curvature, outputs)), work_out)
+    return _steps_kept(key((rod.length, rod.reference_curvature, rod.knots, outputs)), work_out)
 
 
 @dataclass(frozen=True)
@@ -472,13 +474,14 @@ def _problem(
     for place in (load.breakpoints() for load in loads):
         if place is not None:  # torch has no exception for a sample: NaN makes it INVALID
             wrench = torch.where(on_rod(place, robot.rod.length).all(-1, keepdim=True), wrench, torch.nan)
-    return TipProblem(section, table, grid, wrench)
+    rubbing = None if table.tendons is None or table.tendons.friction is None else zero.new_zeros(B, len(robot.tendons))
+    return TipProblem(section, table, grid, wrench, rubbing)
 
 
 def _detached(problem: TipProblem) -> TipProblem:
-    parts = (getattr(problem.section, n).detach() for n in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse", "e3"))
+    parts = (getattr(problem.section, n).detach() for n in (*MATRICES, "e3"))
     grid = Grid(problem.grid.nodes.detach(), problem.grid.outputs)
-    return TipProblem(Section(*parts), problem.table.detached(), grid, problem.wrench.detach())
+    return TipProblem(Section(*parts), problem.table.detached(), grid, problem.wrench.detach(), problem.turned)
 
 
 def _solve(
@@ -502,6 +505,11 @@ def _solve(
         if q_tip is None or not dead:
             r, _ = problem.base(q, q.new_zeros(B, 4, 0), 0 * one)
             q = turned(-r, q)  # exact where no load keeps its direction in the base frame
+        if problem.turned is not None:  # what they turn by if they had not, up to the tip: nearer than nothing
+            states, _ = problem.march(
+                q, q.new_zeros(B, 4, 0), one, torch.zeros(*problem.grid.nodes.shape[:-1], 1, dtype=torch.int64)
+            )
+            problem = replace(problem, turned=-states[:, 0, STATE:].nan_to_num(0.0))
         residual, iterations, stable = 0 * one, torch.zeros(B, dtype=torch.int64), torch.ones(B, dtype=torch.bool)
         valid = torch.isfinite(q).all(-1) if q_tip is None else torch.isfinite(q_tip).all(-1)
         if dead:
@@ -514,6 +522,13 @@ def _solve(
             else:
                 q, residual, iterations = newton(problem, q_tip, one, tolerance * one)
                 stable = _stable(problem, q, unique, sizes.pieces(robot))
+        if problem.turned is not None:
+            start = residual
+            problem, q, residual, more = newton_with_turning(problem, q, one, tolerance)
+            residual, iterations = torch.where(torch.isfinite(start), residual, start), iterations + more
+            if dead:
+                stable = stable & _stable(problem, q, sizes.unique_below(robot), sizes.pieces(robot))
+            whole = replace(whole, turned=problem.turned)
     equilibrium = _equilibrium(
         whole, problem, q, residual, iterations, stable, valid if dead else None, outputs, tolerance, gradients
     )
@@ -557,14 +572,17 @@ def _marched(whole: TipProblem, problem: TipProblem, q_tip: Quaternion) -> Float
     The tip's orientation solves r(q, theta) = 0, so that dq = -J^-1 dr: one more Newton step from the solution, J held, has just
     that.
     """
-    _, J = problem.base(q_tip, turning(q_tip), torch.ones_like(q_tip[:, 0]))
-    at, J_inverse = whole.grid.outputs_and_base, inverse3(J)
+    one, at = torch.ones_like(q_tip[:, 0]), whole.grid.outputs_and_base
+    _, J = problem.base(q_tip, turning(q_tip), one) if problem.turned is None else with_turning(problem, q_tip, one)
+    J_inverse = inverse3(J) if problem.turned is None else torch.linalg.inv(J)
 
-    def states(q: Quaternion) -> Float[Tensor, "B P1 13"]:
-        y = torch.cat([torch.zeros_like(q[:, :3]), q, whole.wrench], -1)
-        return states_at(march(whole.section, y, whole.table, whole.grid, reverse=True), at)
+    def states(at_tip: TipProblem, q: Quaternion) -> Float[Tensor, "B P1 c"]:
+        return states_at(march(whole.section, at_tip.tip_state(q), whole.table, whole.grid, reverse=True), at)
 
-    return states(turned(-matvec(J_inverse, logarithm(states(q_tip)[:, -1, 3:7])), q_tip))
+    base = states(whole, q_tip)[:, -1]
+    move = -matvec(J_inverse, torch.cat([logarithm(base[:, 3:7]), base[:, STATE:]], -1))
+    moved = whole if whole.turned is None else replace(whole, turned=whole.turned + move[:, 3:])
+    return states(moved, turned(move[:, :3], q_tip))
 
 
 def _equilibrium(
@@ -585,16 +603,15 @@ def _equilibrium(
         at = problem.grid.outputs_and_base
         states, _ = problem.march(q_tip, q_tip.new_zeros(len(q_tip), 4, 0), torch.ones_like(residual), at)
         whole = problem
-    p, q, N, M = states.split(STATE_PARTS, -1)
+    p, q, N, M = states[..., :STATE].split(STATE_PARTS, -1)
     base = whole.table.step(0).stage(0).loads
     base = LoadIntegrals(Wn=base.Wn, Wm=base.Wm)
     n0, m0 = section_wrench(q[:, -1], N[:, -1], M[:, -1], whole.section.e3, base)
     wrench = torch.cat([rotate(q[:, -1], n0), rotate(q[:, -1], m0)], -1)
     finite = torch.isfinite(states).flatten(1).all(-1)
     at_base = problem.table.step(0).stage(0)
-    balanced = strains_settled(
-        problem.section.K_se, problem.section.K_bt, problem.section.e3, at_base.u_star, n0.detach(), m0.detach(), at_base.tendons
-    )
+    section = at_base.section or problem.section
+    balanced = strains_settled(section.K_se, section.K_bt, section.e3, at_base.u_star, n0.detach(), m0.detach(), at_base.tendons)
     solved = finite & balanced & (residual <= max(10 * tolerance, SETTLED)) & stable
     valid = finite if valid is None else valid  # a march that overflows under dead loads is no fault of the numbers given
     status = torch.full_like(iterations, int(Status.NOT_CONVERGED))

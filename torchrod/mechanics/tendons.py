@@ -10,28 +10,33 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..util.precision import DTYPE
-from .lie import Matrix, Vector, hat, inverse3, matvec
+from .lie import Matrix, Vector, cross, hat, inverse3, matvec
 
 # Stiff rods: values to round-off and derivatives to 1e-9 (with two steps 1e-12 and only 1e-5). One more, differentiated, follows.
 NEWTON_STEPS = 3
 NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stiffness
 SOFT = 0.1  # this much of it
+STRAIGHT = 1e-3  # rad over the longest tendon: the turning below which a path is as good as straight
 SETTLED = 1e-7  # relative change of the strains that further steps may still make
 Strains = Float[Tensor, "... 6"]
 
 
 @dataclass(frozen=True)
 class Tendon:
-    """One frictionless tendon of uniform tension.
+    """One tendon.
 
     routing: rows [s, x, y] (m): its offset from the centre line in the section frame; one row is a straight tendon, more rows
     are joined by a C2 cubic spline in s. ends_at: arc length (m) at which it is fixed to the rod.
-    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`). Errors: ValueError for what is no tendon.
+    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`). friction: mu, its coefficient of friction
+    on the robot (`turning_rate`). motion: 1 while it is pulled, -1 while it is let out, anything between where that is not known;
+    what counts is motion times friction. Errors: ValueError for what is no tendon.
     """
 
     routing: tuple[tuple[float, float, float], ...]
     ends_at: float
     tension_offset: float = 0.0
+    friction: float = 0.0
+    motion: float = 1.0
 
     def __post_init__(self):
         if not self.routing or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in self.routing):
@@ -42,6 +47,10 @@ class Tendon:
             raise ValueError(f"a tendon ends at {self.ends_at} m; it must be positive and finite")
         if not math.isfinite(self.tension_offset):
             raise ValueError(f"a tendon's tension_offset is {self.tension_offset} N; it must be finite")
+        if not math.isfinite(self.friction):
+            raise ValueError(f"a tendon's friction is {self.friction}; it must be finite")
+        if not -1 <= self.motion <= 1:
+            raise ValueError(f"a tendon's motion is {self.motion}; it must be 1 (pulled), -1 (let out) or between")
 
     @classmethod
     def straight(cls, x: float, y: float, ends_at: float, tension_offset: float = 0.0) -> "Tendon":
@@ -50,10 +59,16 @@ class Tendon:
 
     def offset_at(self, s: Float[Tensor, "..."]) -> tuple[Vector, Vector]:
         """r(s) (m) and r'(s) (-), section frame, third component zero; s may carry derivatives (moving nodes)."""
+        r, dr, _ = self.path_at(s)
+        return r, dr
+
+    def path_at(self, s: Float[Tensor, "..."]) -> tuple[Vector, Vector, Vector]:
+        """The same with r''(s) (1/m)."""
         rows = np.asarray(self.routing)
         zero = s.new_zeros(*s.shape, 1)
         if len(self.routing) == 1:
-            return torch.cat([torch.from_numpy(rows[0, 1:]).expand(*s.shape, 2), zero], -1), torch.cat([zero, zero, zero], -1)
+            none = torch.cat([zero, zero, zero], -1)
+            return torch.cat([torch.from_numpy(rows[0, 1:]).expand(*s.shape, 2), zero], -1), none, none
         from scipy.interpolate import CubicSpline  # a third of a second, for routings that need it
 
         spline = CubicSpline(rows[:, 0], rows[:, 1:])
@@ -61,7 +76,7 @@ class Tendon:
         piece = (torch.searchsorted(knots, s.detach().contiguous(), right=True) - 1).clamp(0, len(knots) - 2)
         t, (c3, c2, c1, c0) = (s - knots[piece]).unsqueeze(-1), c[:, piece]
         r, dr = ((c3 * t + c2) * t + c1) * t + c0, (3 * c3 * t + 2 * c2) * t + c1
-        return torch.cat([r, zero], -1), torch.cat([dr, zero], -1)
+        return torch.cat([r, zero], -1), torch.cat([dr, zero], -1), torch.cat([6 * c3 * t + 2 * c2, zero], -1)
 
 
 @dataclass(frozen=True)
@@ -69,13 +84,22 @@ class TendonTable:
     """Every tendon at given arc lengths, for strains x = [v, u] (..., 6).
 
     along_j = L_j x + r'_j with L_j = [I, -hat(r_j)]: L (..., T, 3, 6), dr (..., T, 3); tau (..., T) N, zero past a tendon's end.
-    newton: how many steps the strain balance takes.
+    newton: how many steps the strain balance takes. friction: of every tendon, (T,), with the sign of its motion, and then ddr,
+    r''_j (..., T, 3), and floor (1/m) as well; tau is then the tension at the base, where it is known.
     """
 
     L: Float[Tensor, "... T 3 6"]
     dr: Float[Tensor, "... T 3"]
     tau: Float[Tensor, "... T"]
     newton: int = NEWTON_STEPS
+    friction: Float[Tensor, " T"] | None = None
+    ddr: Float[Tensor, "... T 3"] | None = None
+    floor: float = 0.0
+
+    def after(self, turned: Float[Tensor, "... T"]) -> "TendonTable":
+        """What is left of the tensions where the tendons have turned so far (rad): tau exp(-mu Theta), the capstan's."""
+        assert self.friction is not None
+        return replace(self, tau=self.tau * torch.exp(-self.friction * turned))
 
 
 @dataclass(frozen=True)
@@ -91,6 +115,12 @@ class Tendons:
     def ends(self) -> tuple[float, ...]:
         """Arc lengths (m) at which tendons end: step boundaries of the integration."""
         return tuple(t.ends_at for t in self.tendons)
+
+    @property
+    def friction(self) -> Float[Tensor, " T"] | None:
+        """Of every tendon, with the sign of its motion; None where there is none."""
+        mu = [t.friction * t.motion for t in self.tendons]
+        return torch.tensor(mu, dtype=DTYPE) if any(mu) else None
 
     def true_tension(self, reading: Float[Tensor, "... T"], clamped: bool = True) -> Float[Tensor, "... T"]:
         """tau = max(reading + tension_offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
@@ -109,11 +139,12 @@ class Tendons:
         self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."], tension: Float[Tensor, "..."], newton: int = NEWTON_STEPS
     ) -> TendonTable:
         """Offsets and tensions at s; `inside` is a point of the same step and decides on which side of a tendon's end s lies."""
-        offsets = [t.offset_at(s) for t in self.tendons]
-        r, dr = torch.stack([r for r, _ in offsets], -2), torch.stack([dr for _, dr in offsets], -2)
+        r, dr, ddr = (torch.stack(x, -2) for x in zip(*(t.path_at(s) for t in self.tendons), strict=True))
         active = inside.detach().unsqueeze(-1) < torch.tensor(self.ends, dtype=DTYPE)
         L = torch.cat([torch.eye(3, dtype=DTYPE).expand(*r.shape, 3), -hat(r)], -1)
-        return TendonTable(L, dr, tension * active, newton)
+        if self.friction is None:
+            return TendonTable(L, dr, tension * active, newton)
+        return TendonTable(L, dr, tension * active, newton, self.friction, ddr, STRAIGHT / max(self.ends))
 
 
 def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "... T 6"], Float[Tensor, "... T 1"]]:
@@ -126,6 +157,23 @@ def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "..
     along = (table.L * x[..., None, None, :]).sum(-1) + table.dr
     stretch = (along * along).sum(-1, keepdim=True).sqrt()
     return (table.L * (along / stretch).unsqueeze(-1)).sum(-2), stretch
+
+
+def turning_rate(x: Strains, table: TendonTable) -> Float[Tensor, "... T"]:
+    """Theta'_j = |u x t_j + t_j'| (1/m): how fast every tendon's path turns along the rod; zero where it carries nothing.
+
+    t_j' is how t_j changes with the routing, at the strains of the section: (u x r_j' + r_j'') / |along_j| normal to t_j. What the
+    strains' own change adds is left out: v' is of the size of a load's force per length / GA, and r_j u_z' is nothing without
+    torsion that varies. Exact where the strains are uniform, as on a helix, and where the rod bends in a plane under straight
+    tendons. Smooth at zero: (Theta'^2 + floor^2)^(1/2). tau' = -mu tau Theta' is the capstan. Source: docs/model.md.
+    """
+    assert table.ddr is not None
+    along = (table.L * x[..., None, None, :]).sum(-1) + table.dr
+    stretch = (along * along).sum(-1, keepdim=True).sqrt()
+    t, u = along / stretch, x[..., None, 3:]
+    change = cross(u, table.dr) + table.ddr
+    turn = cross(u, t) + (change - (t * change).sum(-1, keepdim=True) * t) / stretch
+    return (table.tau.detach() > 0) * ((turn * turn).sum(-1) + table.floor**2).sqrt()
 
 
 def balance_inverse(
@@ -174,7 +222,7 @@ def balanced_strains(
 
     w = torch.cat([N, M], -1)
     w0, K_se0, K_bt0 = w.detach(), K_se.detach(), K_bt.detach()
-    frozen = TendonTable(table.L, table.dr, table.tau.detach(), table.newton)
+    frozen = replace(table, tau=table.tau.detach())
     LtL = (table.L.unsqueeze(-1) * table.L.unsqueeze(-2)).sum(-3)
     x, inverse = x_star, x_star
     for _ in range(table.newton):

@@ -14,7 +14,7 @@ from .grid import Grid
 from .integrate import march_linearized
 from .jacobian import pointwise_jacobian
 from .lie import Matrix, Quaternion, Vector, cross, hat, inverse3, logarithm, matvec, normalized, turned
-from .section import Section, StageTable
+from .section import STATE, Section, StageTable
 
 ORIENTATION_TOLERANCE = 1e-11  # rad: the forward solve's residual, far below what RK4 leaves
 SETTLED = 1e-7  # rad: where rounding, which a rod under tension multiplies, lets Newton come no nearer
@@ -25,27 +25,41 @@ MAX_NEWTON = 40
 class TipProblem:
     """The march from a guessed tip orientation, with the loads of the base frame scaled by a fraction per sample.
 
-    wrench: what the tip carries, [N~, M~] of mechanics.section just beyond it.
+    wrench: what the tip carries, [N~, M~] of mechanics.section just beyond it. turned: (B, T) rad, how far the tendons have turned
+    from the base to the tip, where they rub: unknown, like the tip's orientation.
     """
 
     section: Section
     table: StageTable
     grid: Grid
     wrench: Float[Tensor, "B 6"]
+    turned: Float[Tensor, "B T"] | None = None
 
     def take(self, index: Int[Tensor, " b"]) -> "TipProblem":
         """The samples of an index, which may repeat."""
-        return replace(self, table=self.table.take(index), grid=self.grid.take(index), wrench=self.wrench[index])
+        turned = None if self.turned is None else self.turned[index]
+        return replace(self, table=self.table.take(index), grid=self.grid.take(index), wrench=self.wrench[index], turned=turned)
 
     def march(
         self, q_tip: Float[Tensor, "B 4"], dq_tip: Float[Tensor, "B 4 n"], fraction: Float[Tensor, " B"], keep: Int[Tensor, "*B P"]
-    ) -> tuple[Float[Tensor, "B P 13"], Float[Tensor, "B P 13 n"]]:
-        """States at the nodes `keep`, and their derivatives when the tip's orientation moves along dq_tip."""
-        y = torch.cat([torch.zeros_like(q_tip[:, :3]), q_tip, self.wrench], -1)
-        dy = torch.nn.functional.pad(dq_tip, (0, 0, 3, 6))
+    ) -> tuple[Float[Tensor, "B P c"], Float[Tensor, "B P c n"]]:
+        """States at the nodes `keep`, and their derivatives when the tip's orientation moves along dq_tip.
+
+        Where the tendons rub, more columns of dq_tip may move Theta at the tip as well: (B, 4 + T, n).
+        """
+        y, tendons = self.tip_state(q_tip), 0 if self.turned is None else self.turned.shape[-1]
+        dq, dturned = dq_tip[:, :4], dq_tip[:, 4:]
+        dy = torch.cat(
+            [torch.nn.functional.pad(dq, (0, 0, 3, 6)), torch.nn.functional.pad(dturned, (0, 0, 0, tendons - dturned.shape[1]))], 1
+        )
         return march_linearized(
             self.section, y, dy, self.table.with_base_frame_loads_scaled(fraction), None, self.grid, keep, reverse=True
         )
+
+    def tip_state(self, q_tip: Float[Tensor, "B 4"]) -> Float[Tensor, "B c"]:
+        """y at the tip."""
+        parts = [torch.zeros_like(q_tip[:, :3]), q_tip, self.wrench]
+        return torch.cat(parts if self.turned is None else [*parts, self.turned], -1)
 
     def base(
         self, q_tip: Float[Tensor, "B 4"], dq_tip: Float[Tensor, "B 4 n"], fraction: Float[Tensor, " B"]
@@ -80,6 +94,46 @@ def turning(q: Float[Tensor, "B 4"]) -> Float[Tensor, "B 4 3"]:
     """dq = (e_k, 0) q / 2 of a unit turn about each axis e_k of the base frame."""
     v, w = q[:, :3], q[:, 3, None, None]
     return 0.5 * torch.cat([w * torch.eye(3, dtype=q.dtype) - hat(v), -v.unsqueeze(1)], 1)
+
+
+def with_turning(problem: TipProblem, q: Float[Tensor, "B 4"], fraction: Float[Tensor, " B"]) -> tuple[Tensor, Tensor]:
+    """r and dr of orientation and of Theta at the base together, (B, 3 + T) and (B, 3 + T, 3 + T): both must vanish there."""
+    assert problem.turned is not None
+    T = problem.turned.shape[-1]
+    moves = torch.cat([torch.nn.functional.pad(turning(q), (0, T, 0, T)), q.new_zeros(len(q), 4 + T, 0)], -1)
+    moves[:, 4:, 3:] = torch.eye(T, dtype=q.dtype)
+    first = torch.zeros(*problem.grid.nodes.shape[:-1], 1, dtype=torch.int64)
+    states, tangents = problem.march(q, moves, fraction, first)
+    r, dr = pointwise_jacobian(logarithm, states[:, 0, 3:7])
+    return torch.cat([r, states[:, 0, STATE:]], -1), torch.cat([dr @ tangents[:, 0, 3:7], tangents[:, 0, STATE:]], 1)
+
+
+def newton_with_turning(
+    problem: TipProblem, q: Quaternion, fraction: Float[Tensor, " B"], enough: float, most: int = MAX_NEWTON
+) -> tuple[TipProblem, Quaternion, Float[Tensor, " B"], Int[Tensor, " B"]]:
+    """As `newton`, of the tip's orientation and of how far the tendons have turned there, which the problem returned has."""
+    so_far = problem.turned
+    assert so_far is not None
+    best, damping = torch.full_like(fraction, torch.inf), torch.ones_like(fraction)
+    anchor, at, move = q, so_far, torch.zeros_like(torch.cat([q[:, :3], so_far], -1))
+    iterations = torch.zeros(best.shape, dtype=torch.int64)
+    for _ in range(most):
+        r, J = with_turning(problem, q, fraction)
+        step = -torch.linalg.solve_ex(J, r.unsqueeze(-1)).result.squeeze(-1)
+        size = r.norm(dim=-1)
+        better = (size < best).unsqueeze(-1)
+        anchor, at, move = torch.where(better, q, anchor), torch.where(better, so_far, at), torch.where(better, step, move)
+        best, damping = torch.where(size < best, size, best), torch.where(size < best, 1.0, 0.5 * damping)
+        active = (best > enough) & torch.isfinite(best) & (damping > 1e-3)
+        iterations = iterations + active
+        if not active.any():
+            break
+        scaled = (damping / move[:, :3].norm(dim=-1).clamp(min=1.0)).unsqueeze(-1) * move
+        go = active.unsqueeze(-1)
+        q = torch.where(go, normalized(turned(scaled[:, :3], anchor)), anchor)
+        so_far = torch.where(go, at + scaled[:, 3:], at)
+        problem = replace(problem, turned=so_far)
+    return replace(problem, turned=at), anchor, best, iterations
 
 
 def newton(

@@ -311,6 +311,10 @@ class Problem(Float64):
     def _strains(self, shape: Shape, x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
         """v (-) and u (1/m) at the arc lengths `at` of all sensors', taken from the rates of mechanics.section."""
         loads, robot = self.unknowns.loads.loads(x[..., self.state.loads.at]), self.robot
+        if robot.tendons.friction is not None:
+            raise ValueError(
+                "strains are not worked out where tendons rub; leave out curvatures and uncertain arc lengths, or friction"
+            )
         table = stage_table(robot, loads, self.pulling(x), Places(self.s[at])).stage(0)
         q = shape.q[..., at, :]
         y = torch.cat([shape.p[..., at, :], q, shape.wrench[..., at, :]], -1)
