@@ -25,6 +25,7 @@ from ..model.load_families import GaussianCoordinates
 from ..model.marker_geometry import misplaced
 from ..model.problem import Problem
 from ..model.sensors import Markers
+from ..model.sensors.sensor import variance
 from ..model.unknowns import Registration, Unknowns
 from ..util.status import Status
 from .count import free_parameters
@@ -230,7 +231,7 @@ def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
         return [()] * problem.batch
     fit = estimate_each(problem, replace(settings, robust=ROBUST))
     few = fit.outlier.sum(-1) <= FEW * markers.present.sum(-1)
-    noise = markers.noise.unsqueeze(-1) if isinstance(markers.noise, Tensor) else markers.noise
+    noise = variance(markers.noise) ** 0.5
     told = fit.outlier & (fit.residual.norm(dim=-1) > CLEAR * noise) & (fit.accepted & few).unsqueeze(-1)
     return [tuple(row.nonzero().flatten().tolist()) for row in told]
 

@@ -11,7 +11,7 @@ from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
-from ..io import RESULT_SUFFIXES, Shapes, read_robot, read_shapes, write_result
+from ..io import RESULT_SUFFIXES, Noises, Shapes, read_robot, read_shapes, write_result
 from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
@@ -68,13 +68,21 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
     unknowns = Unknowns(loads, options.unknown_tip, std, _registration(options))
     stated = STATED * rod.length if noise is None else noise
-    return Problem(robot, unknowns, [shapes.markers(stated)], shapes.tension, options.steps or 0)
+    positive("--angle-noise", options.angle_noise)
+    for value in options.base_noise or ():
+        positive("--base-noise", value)
+    base = None if options.base_noise is None else (options.base_noise[0], options.base_noise[1])
+    noises = Noises(stated, options.angle_noise, base)
+    try:
+        return Problem(robot, unknowns, shapes.sensors(noises), shapes.tension, options.steps or 0)
+    except ValueError as error:
+        raise InputError(f"{options.shapes}: {error}") from None
 
 
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot)
+    shapes = read_shapes(options.shapes, robot, options.units)
     noise = noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)

@@ -12,6 +12,7 @@ from jsonargparse.typing import restricted_number_type
 import torchrod
 
 from ..util.errors import InputError
+from ..util.units import LENGTHS
 from .arguments import MOST_STEPS, apart
 from .screen import held_back, one_line, tell
 
@@ -47,12 +48,19 @@ def _number_list(
     parser.add_argument(name, type=float, nargs=count, metavar=metavar, help=help)
 
 
+def _units(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--units", type=str, choices=list(LENGTHS), default=None, help="of the lengths in SHAPES; by default metres"
+    )
+
+
 def _estimate_parser() -> ArgumentParser:
     parser = _Parser(
         description="Estimate where, which way and how hard a robot is pushed, from the measured positions of its markers."
     )
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz: marker positions (m), base frame")
+    _units(parser)
     parser.add_argument("--contacts", type=str, default=None, help="number of loads (1), or auto: as many as the data ask for")
     parser.add_argument(
         "--load-prior",
@@ -62,6 +70,8 @@ def _estimate_parser() -> ArgumentParser:
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
     parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
+    parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
+    _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))
     parser.add_argument("--robust", action="store_true", help="let markers far off weigh little, and name them")
     parser.add_argument("--tension-std", type=float, default=None, help="std of the tensions' sensors (N); else exact")
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
@@ -89,6 +99,7 @@ def _calibrate_parser() -> ArgumentParser:
     parser = _Parser(description="Mass per length of a robot, from shapes that nothing but gravity and its tendons bends.")
     parser.add_argument("robot", type=str, help="ROBOT.toml with gravity; its mass_per_length is the start, if positive")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz without external load, all of this robot")
+    _units(parser)
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
     parser.add_argument("--youngs-modulus", action="store_true", help="also the stiffness, E and G together; needs tensions")
     parser.add_argument("--tension-offset", action="store_true", help="also one offset (N) per tendon, added to its readings")
@@ -163,6 +174,7 @@ def _plot_parser() -> ArgumentParser:
     parser = _Parser(description="Draw one sample of an estimate.")
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument("shapes", type=str, help="the shapes that were estimated")
+    _units(parser)
     parser.add_argument("result", type=str, help="RESULT.json or .npz of torchrod estimate")
     parser.add_argument("--sample", type=str, default=None, help="which sample; the first by default")
     parser.add_argument("--out", type=str, required=True, help="FIGURE.png")

@@ -5,11 +5,14 @@ from .observability_file import write_observability, write_observability_table
 from .result_file import RESULT_SUFFIXES, read_fit, write_result
 from .robot_file import read_robot
 from .robot_text import write_calibrated
-from .shape_file import Shapes, read_shapes, write_shapes
+from .shape_file import read_shapes, write_shapes
+from .shapes import KINDS, Noises, Shapes
 
 __all__ = [
     "CALIBRATION_SUFFIXES",
+    "KINDS",
     "RESULT_SUFFIXES",
+    "Noises",
     "Shapes",
     "read_fit",
     "read_robot",

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...mechanics.lie import Matrix, Vector, matvec, rotate
 from ...util.precision import Float64
-from .sensor import RodState, check_noise, shape_error, variance
+from .sensor import RodState, check_noise, noise_shape, shape_error, variance
 
 
 @dataclass(frozen=True)
@@ -16,13 +16,13 @@ class Markers(Float64):
     """Measured positions of P markers on B samples: p(s) + R(s) r + noise, three rows for each marker.
 
     s: (P,) m, arc lengths. positions: (B, P, 3) m, base frame, NaN where a marker is missing. noise: standard deviation of a
-    coordinate (m), one number or one for each sample (B,). offsets: (P, 3) m, r, from the centre line in the section frame.
-    Errors: ValueError of `check`.
+    coordinate (m), one number, one for each sample (B,) or one for each marker of each sample (B, P). offsets: (P, 3) m, r, from
+    the centre line in the section frame. Errors: ValueError of `check`.
     """
 
     s: Float[Tensor, " P"]
     positions: Float[Tensor, "B P 3"]
-    noise: float | Float[Tensor, " B"]
+    noise: float | Float[Tensor, " B"] | Float[Tensor, "B P"]
     offsets: Float[Tensor, "P 3"] | None = None
 
     def __post_init__(self):
@@ -58,7 +58,7 @@ class Markers(Float64):
     @property
     def weights(self) -> Float[Tensor, "B rows"]:
         """1 / noise^2."""
-        return self.present.to(self.s.dtype).repeat_interleave(3, -1) / variance(self.noise)
+        return (self.present.to(self.s.dtype) / variance(self.noise)).repeat_interleave(3, -1)
 
     def distances(self, rows: Float[Tensor, "B rows"]) -> Float[Tensor, "B K 3"]:
         """All of them."""
@@ -80,7 +80,9 @@ class Markers(Float64):
     def check(self) -> None:
         """Shapes that belong together, at least one marker of one sample, finite arc lengths, a noise."""
         P, B = self.s.numel(), len(self.positions)
-        if said := shape_error(self, {"s": (P,), "positions": (B, P, 3), "noise": (B,), "offsets": (P, 3)}):
+        if said := shape_error(
+            self, {"s": (P,), "positions": (B, P, 3), "noise": noise_shape(self.noise, B, P), "offsets": (P, 3)}
+        ):
             raise ValueError(f"{said} with {P} arc lengths and {B} samples")
         if not P or not B:
             raise ValueError("there are no markers; give at least one sample with markers")

@@ -1,6 +1,7 @@
 """What every sensor supplies, and what it is told of the rod."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -82,7 +83,7 @@ class Sensor(Protocol):
         ...
 
 
-def shape_error(sensor: object, wanted: dict[str, tuple[int | None, ...]]) -> str | None:
+def shape_error(sensor: object, wanted: Mapping[str, tuple[int | None, ...]]) -> str | None:
     """What does not have its shape, in one sentence; None in a shape stands for any number."""
     for name, shape in wanted.items():
         value = getattr(sensor, name)
@@ -93,9 +94,14 @@ def shape_error(sensor: object, wanted: dict[str, tuple[int | None, ...]]) -> st
     return None
 
 
-def variance(noise: float | Float[Tensor, " B"]) -> float | Float[Tensor, "B 1"]:
-    """noise^2, of all rows of a sample."""
-    return noise.unsqueeze(-1) ** 2 if isinstance(noise, Tensor) else noise**2
+def variance(noise: float | Float[Tensor, " B"] | Float[Tensor, "B P"]) -> float | Float[Tensor, "B P"]:
+    """noise^2, of all places of a sample or of each."""
+    return noise.unsqueeze(-1) ** 2 if isinstance(noise, Tensor) and noise.ndim == 1 else noise**2
+
+
+def noise_shape(noise: float | Tensor, B: int, P: int) -> tuple[int, ...]:
+    """The shape that a noise must have: one number for each sample, or one for each place of each sample."""
+    return (B, P) if isinstance(noise, Tensor) and noise.ndim == 2 else (B,)
 
 
 def check_noise(name: str, noise: float | Tensor, unit: str) -> None:
