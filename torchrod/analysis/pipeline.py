@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..estimation.load_places import LoadPlaces, load_places
 from ..estimation.load_profile import Profile, joined_profile
 from ..estimation.result import Estimate
 from ..estimation.shared import STEPS, BaseFrame, with_shared_frame
@@ -78,6 +79,11 @@ class Analysis:
     def profile(self) -> Profile | None:
         """f(s) of every sample with its band; None for point loads, which have no density."""
         return joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
+
+    @cached_property
+    def places(self) -> LoadPlaces:
+        """Where the loads act in space, and their forces in the robot's base frame."""
+        return load_places(self.problem, self.parts, self.estimate)
 
     def message(self, sample: int) -> str:
         """What became of a sample, what is wrong with it, and what to do."""

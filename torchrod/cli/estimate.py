@@ -11,7 +11,7 @@ from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
-from ..io import RESULT_SUFFIXES, Noises, Shapes, read_robot, read_shapes, write_result
+from ..io import RESULT_SUFFIXES, Noises, Shapes, read_base_pose, read_robot, read_shapes, write_result
 from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
@@ -101,7 +101,8 @@ def estimate(options: Namespace) -> None:
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
     if options.out:
-        write_result(options.out, fit, shapes.samples, robot.name, found.evidence, found.profile, found.diagnosis, found.noise)
+        further = (found.evidence, found.profile, found.diagnosis, found.noise, found.places, read_base_pose(options.robot))
+        write_result(options.out, fit, shapes.samples, robot.name, *further, shapes.time)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
 

@@ -83,7 +83,7 @@ def _estimate_parser() -> ArgumentParser:
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
     )
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
-    parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
+    parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
     parser.add_argument(
         "--steps",
