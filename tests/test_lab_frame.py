@@ -68,10 +68,10 @@ def test_what_is_no_pose(tmp_path, lines, words):
 def test_millimetres_and_degrees(tmp_path):
     """The same robot in both units."""
     rod = "youngs_modulus = 207e9\nshear_modulus = 79e9\n"
-    tendons = "[[tendons]]\nradius = 0.007\nangle = 1.5707963267948966\nends_at = 0.3\n[[tendons]]\nrouting = [[0, 0.007, 0], [0.4, 0, 0.01]]\n"
-    in_mm = (
-        "[[tendons]]\nradius_mm = 7\nangle_deg = 90\nends_at_mm = 300.0\n[[tendons]]\nrouting_mm = [[0, 7, 0], [400, 0, 10.0]]\n"
-    )
+    tendons = "[[tendons]]\nradius = 0.007\nangle = 1.5707963267948966\nends_at = 0.3\n"
+    tendons += "[[tendons]]\nrouting = [[0, 0.007, 0], [0.4, 0, 0.01]]\n"
+    in_mm = "[[tendons]]\nradius_mm = 7\nangle_deg = 90\nends_at_mm = 300.0\n"
+    in_mm += "[[tendons]]\nrouting_mm = [[0, 7, 0], [400, 0, 10.0]]\n"
     (tmp_path / "a.toml").write_text(f"name = 'r'\n[rod]\nlength = 0.4\ndiameter = 0.0014\n{rod}{tendons}")
     (tmp_path / "b.toml").write_text(f"name = 'r'\n[rod]\nlength_mm = 400\ndiameter_mm = 1.4\n{rod}{in_mm}")
     one, other = (read_robot(tmp_path / f"{name}.toml") for name in "ab")
