@@ -16,6 +16,7 @@ from ..util.units import LENGTHS
 from .arguments import MOST_STEPS, apart
 from .screen import held_back, one_line, tell
 
+IMPORTED = ("motive", "vicon", "qualisys", "trc", "c3d", "aurora", "toolbox", "fbgs", "luna", "wide")
 Steps = restricted_number_type("from 1 to 100,000", int, [(">=", 1), ("<=", MOST_STEPS)])
 
 
@@ -170,6 +171,16 @@ def _dataset_parser() -> ArgumentParser:
     return parser
 
 
+def _import_parser() -> ArgumentParser:
+    parser = _Parser(description="Shapes from a file of a measuring system, in the robot's base frame.")
+    parser.add_argument("format", type=str, choices=IMPORTED, help="what wrote the file; wide: a table with a line for each frame")
+    parser.add_argument("file", type=str, help="the file, as it was exported")
+    parser.add_argument("--robot", type=str, required=True, help="ROBOT.toml")
+    parser.add_argument("--layout", type=str, required=True, help="LAYOUT.toml: which name is what on the robot")
+    parser.add_argument("--out", type=str, required=True, help="SHAPES.csv or .npz")
+    return parser
+
+
 def _plot_parser() -> ArgumentParser:
     parser = _Parser(description="Draw one sample of an estimate.")
     parser.add_argument("robot", type=str, help="ROBOT.toml")
@@ -192,12 +203,14 @@ COMMANDS = {
     "observability": (_observability_parser, "what markers will see, and where to put them"),
     "simulate": (_simulate_parser, "marker positions from known loads"),
     "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
+    "import": (_import_parser, "shapes from files of motion capture, trackers and fibres"),
     "plot": (_plot_parser, "a figure of an estimate"),
     "build": (_build_parser, "compile the kernel before it is needed"),
 }
 
 
-HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
+HOMES = {"simulate-dataset": "simulate", "import": "lab_import"}  # commands that share a module, or have a word of Python's as name
+FUNCTIONS = {"import": "lab_import"}
 
 
 def _parser() -> ArgumentParser:
@@ -210,10 +223,10 @@ def _parser() -> ArgumentParser:
 
 
 def _run(options: Namespace) -> None:
-    name = options.subcommand
+    name = str(options.subcommand)
     home = importlib.import_module(f".{HOMES.get(name, name)}", __package__)
     apart(options[name])
-    getattr(home, name.replace("-", "_"))(options[name])
+    getattr(home, FUNCTIONS.get(name, name.replace("-", "_")))(options[name])
 
 
 def main(arguments: list[str] | None = None) -> int:
