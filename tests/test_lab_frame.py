@@ -144,3 +144,15 @@ def test_a_frame_that_was_found_moves_the_robot_in_the_lab(tmp_path):
     assert np.allclose(load["position_lab_m"], seen[0, 10].numpy() + np.array([0, 0, 1]), atol=2e-4)
     q = Rotation.from_quat(shape.q[0, 10].numpy())
     assert np.allclose(load["force_lab_N"], (off * q).apply([0.6, 0.2, 0.0]), atol=1e-2)
+
+
+def test_profiles_of_a_large_batch_are_written_where_they_are_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("torchrod.cli.estimate.MOST_PROFILES", 1)
+    (tmp_path / "r.toml").write_text(ROD)
+    shape = solve_shape(steel_rod(), (), None, T(np.linspace(0.05, 0.4, 8)), 2)
+    write_shapes(tmp_path / "s.csv", Shapes(T(np.linspace(0.05, 0.4, 8)), shape.p, ["a", "b"]))
+    for option, written in ((["--profile", "on"], True), (["--profile", "off"], False), ([], False)):
+        out = tmp_path / "o.json"
+        assert main(["estimate", str(tmp_path / "r.toml"), str(tmp_path / "s.csv"), "--out", str(out), *option]) == 0
+        assert all(("profile" in record) == written for record in json.loads(out.read_text())["results"])
+        assert ("--profile on writes them" in capsys.readouterr().err) == (not option)

@@ -9,6 +9,7 @@ from jsonargparse import Namespace
 from ..analysis.count import Hypothesis, StartFor
 from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
+from ..estimation.load_profile import Profile
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
 from ..io import RESULT_SUFFIXES, Noises, Shapes, read_base_pose, read_robot, read_shapes, write_result
@@ -23,6 +24,7 @@ from ..util.progress import bar
 from .arguments import FIGURE_SUFFIXES, noise_or_auto, positive, writable
 from .table import table
 
+MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 5 ms each
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
 
 
@@ -101,10 +103,24 @@ def estimate(options: Namespace) -> None:
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
     if options.out:
-        further = (found.evidence, found.profile, found.diagnosis, found.noise, found.places, read_base_pose(options.robot))
-        write_result(options.out, fit, shapes.samples, robot.name, *further, shapes.time)
+        said = (found.evidence, _profile(options, found), found.diagnosis, found.noise, found.places)
+        write_result(options.out, fit, shapes.samples, robot.name, *said, read_base_pose(options.robot), shapes.time)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
+
+
+def _profile(options: Namespace, found: Analysis) -> Profile | None:
+    """The load profile, whose band takes far longer than the fit; of a large batch only where it is asked for, which is told."""
+    if options.profile == "off" or options.out.endswith(".csv"):
+        return None
+    if options.profile == "auto" and found.problem.batch > MOST_PROFILES:
+        warnings.warn(
+            f"{options.out}: without the load profiles of {found.problem.batch} samples, which would take longer than all else; "
+            "--profile on writes them",
+            stacklevel=2,
+        )
+        return None
+    return found.profile
 
 
 def _starts(options: Namespace, problem: Problem, candidates: list[Hypothesis]) -> StartFor:

@@ -85,6 +85,8 @@ def _estimate_parser() -> ArgumentParser:
     )
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
+    about = "whether RESULT has the load profiles and their bands; auto: up to 1,000 samples"
+    parser.add_argument("--profile", type=str, choices=["auto", "on", "off"], default="auto", help=about)
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
     parser.add_argument(
         "--steps",

@@ -46,7 +46,7 @@ def load_places(problem: Problem, parts: Sequence[tuple[Unknowns, Int[Tensor, " 
     for unknowns, index in parts:
         own = problem.of(unknowns)
         known = index[torch.isfinite(fit.x[index, : own.size]).all(-1)]
-        for some in known.split(CHUNK) if K and own.unknowns.loads.size else ():
+        for some in known.split(CHUNK) if len(known) and K and own.unknowns.loads.size else ():
             unseen = Markers(s, torch.full((len(some), NODES, 3), torch.nan, dtype=DTYPE), 1.0)
             shape = replace(own.take(some), sensors=[unseen]).shape(fit.x[some, : own.size], False)
             at = fit.location[some].clamp(0, L) / L * (NODES - 1)
