@@ -14,6 +14,7 @@ markers closer together than a few standard deviations. The fit that is reported
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -71,8 +72,16 @@ class Diagnosis:
         names, places = _listed([str(i + 1) for i in markers]), _listed([f"{1e3 * float(self.s[i]):.4g}" for i in markers])
         return f"Marker{'s' * (len(markers) > 1)} {names} (s = {places} mm)"
 
+    @cached_property
+    def told(self) -> list[bool]:
+        """Of which samples there is something to say."""
+        by_tensor = (torch.isfinite(self.registration).all(-1) | self.one_more).tolist()
+        return [any(parts) for parts in zip(by_tensor, self.exchanged, self.geometry, self.outliers, strict=True)]
+
     def message(self, sample: int) -> str:
         """Sentences with the remedy, or nothing."""
+        if not self.told[sample]:
+            return ""
         said = []
         for cycle in self.exchanged[sample]:
             said.append(f"{self._named(cycle)} look exchanged; exchange their labels.")

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..estimation.load_places import LoadPlaces, load_places
 from ..estimation.load_profile import Profile, joined_profile
 from ..estimation.result import Estimate
 from ..estimation.shared import STEPS, BaseFrame, with_shared_frame
@@ -21,6 +22,7 @@ from .alternatives import other_solutions
 from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, select
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
+from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_noise, part_of, patterns
 
 
 def learned_or_cold(problem: Problem) -> StartRule:
@@ -80,6 +82,11 @@ class Analysis:
         """f(s) of every sample with its band; None for point loads, which have no density."""
         return joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
 
+    @cached_property
+    def places(self) -> LoadPlaces:
+        """Where the loads act in space, and their forces in the robot's base frame."""
+        return load_places(self.problem, self.parts, self.estimate)
+
     def message(self, sample: int) -> str:
         """What became of a sample, what is wrong with it, and what to do."""
         return f"{self.estimate.message(sample)} {self.diagnosis.message(sample)}".rstrip()
@@ -100,6 +107,15 @@ def analyze(
     registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
     progress, called with a total and a name. Errors: ValueError as torchrod.estimate.
     """
+    registration = problem.unknowns.registration
+    split = patterns(problem) if registration is None or registration.scope is not Scope.SHARED else []
+    if split:
+        with bar(problem.batch, "samples") as shown:
+            found = []
+            for pattern in split:
+                found.append(analyze(part_of(problem, pattern), candidates, unknown_noise, settings, start))
+                shown.update(len(pattern.samples))
+        return _joined(problem, found, split)
     settings, noise = settings or Settings(), None
     competing = list(candidates) if candidates is not None else [Hypothesis("", _count(problem), problem.unknowns)]
     if unknown_noise:
@@ -119,7 +135,7 @@ def analyze(
             found = estimate_each(only, settings, start(only), shown.update)
         return found, [(only.unknowns, torch.arange(problem.batch))]
 
-    registration, frame = problem.unknowns.registration, None
+    frame = None
     if registration is not None and registration.scope is Scope.SHARED:
         with bar(STEPS * problem.batch, "base frame") as shown:
             shared = with_shared_frame(problem, fitted, settings, shown.update)
@@ -131,6 +147,20 @@ def analyze(
     found = found if noise is None else noise.judged(found)
     diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
     return Analysis(problem, found, parts, evidence, noise, frame, diagnosis)
+
+
+def _joined(problem: Problem, found: Sequence[Analysis], split: Sequence[Pattern]) -> Analysis:
+    """The analysis of a batch that was split; every part has the same hypotheses."""
+    B = problem.batch
+    parts = []
+    for h, (unknowns, _) in enumerate(found[0].parts):
+        parts.append((unknowns, torch.cat([p.samples[a.parts[h][1]] for a, p in zip(found, split, strict=True)])))
+    noise = joined_noise([a.noise for a in found], split, B)
+    problem = problem.of(parts[0][0]) if len(parts) == 1 else problem
+    estimate = joined_estimate([a.estimate for a in found], split, problem)
+    evidence = joined_evidence([a.evidence for a in found], split, B)
+    diagnosis = joined_diagnosis([a.diagnosis for a in found], split, problem)
+    return Analysis(problem, estimate, parts, evidence, noise, None, diagnosis)
 
 
 def _count(problem: Problem) -> int:

@@ -22,7 +22,7 @@ def calibrate(options: Namespace) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*nothing hangs")  # the mass is what is sought
         robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot)
+    shapes = read_shapes(options.shapes, robot, options.units)
     noise_std(options.noise)
     positive("--max-iterations", options.max_iterations)
     writable(options.out, (".toml",))

@@ -9,9 +9,10 @@ from jsonargparse import Namespace
 from ..analysis.count import Hypothesis, StartFor
 from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
+from ..estimation.load_profile import Profile
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
-from ..io import RESULT_SUFFIXES, Shapes, read_robot, read_shapes, write_result
+from ..io import RESULT_SUFFIXES, Noises, Shapes, read_base_pose, read_robot, read_shapes, write_result
 from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
@@ -23,6 +24,7 @@ from ..util.progress import bar
 from .arguments import FIGURE_SUFFIXES, noise_or_auto, positive, writable
 from .table import table
 
+MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 5 ms each
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
 
 
@@ -68,13 +70,23 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
     unknowns = Unknowns(loads, options.unknown_tip, std, _registration(options))
     stated = STATED * rod.length if noise is None else noise
-    return Problem(robot, unknowns, [shapes.markers(stated)], shapes.tension, options.steps or 0)
+    positive("--angle-noise", options.angle_noise)
+    for value in options.base_noise or ():
+        positive("--base-noise", value)
+    base = None if options.base_noise is None else (options.base_noise[0], options.base_noise[1])
+    if options.curvature_noise is not None:
+        positive("--curvature-noise", options.curvature_noise)
+    noises = Noises(stated, options.angle_noise, base, options.curvature_noise)
+    try:
+        return Problem(robot, unknowns, shapes.sensors(noises), shapes.tension, options.steps or 0)
+    except ValueError as error:
+        raise InputError(f"{options.shapes}: {error}") from None
 
 
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot)
+    shapes = read_shapes(options.shapes, robot, options.units)
     noise = noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)
@@ -93,9 +105,24 @@ def estimate(options: Namespace) -> None:
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
     if options.out:
-        write_result(options.out, fit, shapes.samples, robot.name, found.evidence, found.profile, found.diagnosis, found.noise)
+        said = (found.evidence, _profile(options, found), found.diagnosis, found.noise, found.places)
+        write_result(options.out, fit, shapes.samples, robot.name, *said, read_base_pose(options.robot), shapes.time)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
+
+
+def _profile(options: Namespace, found: Analysis) -> Profile | None:
+    """The load profile, whose band takes far longer than the fit; of a large batch only where it is asked for, which is told."""
+    if options.profile == "off" or options.out.endswith(".csv"):
+        return None
+    if options.profile == "auto" and found.problem.batch > MOST_PROFILES:
+        warnings.warn(
+            f"{options.out}: without the load profiles of {found.problem.batch} samples, which would take longer than all else; "
+            "--profile on writes them",
+            stacklevel=2,
+        )
+        return None
+    return found.profile
 
 
 def _starts(options: Namespace, problem: Problem, candidates: list[Hypothesis]) -> StartFor:

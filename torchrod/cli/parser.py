@@ -12,9 +12,11 @@ from jsonargparse.typing import restricted_number_type
 import torchrod
 
 from ..util.errors import InputError
+from ..util.units import LENGTHS
 from .arguments import MOST_STEPS, apart
 from .screen import held_back, one_line, tell
 
+IMPORTED = ("motive", "vicon", "qualisys", "trc", "c3d", "aurora", "toolbox", "fbgs", "luna", "wide")
 Steps = restricted_number_type("from 1 to 100,000", int, [(">=", 1), ("<=", MOST_STEPS)])
 
 
@@ -47,12 +49,19 @@ def _number_list(
     parser.add_argument(name, type=float, nargs=count, metavar=metavar, help=help)
 
 
+def _units(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--units", type=str, choices=list(LENGTHS), default=None, help="of the lengths in SHAPES; by default metres"
+    )
+
+
 def _estimate_parser() -> ArgumentParser:
     parser = _Parser(
         description="Estimate where, which way and how hard a robot is pushed, from the measured positions of its markers."
     )
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz: marker positions (m), base frame")
+    _units(parser)
     parser.add_argument("--contacts", type=str, default=None, help="number of loads (1), or auto: as many as the data ask for")
     parser.add_argument(
         "--load-prior",
@@ -62,6 +71,9 @@ def _estimate_parser() -> ArgumentParser:
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
     parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
+    parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
+    _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))
+    parser.add_argument("--curvature-noise", type=float, default=None, help="std of a measured curvature kx, ky (1/m)")
     parser.add_argument("--robust", action="store_true", help="let markers far off weigh little, and name them")
     parser.add_argument("--tension-std", type=float, default=None, help="std of the tensions' sensors (N); else exact")
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
@@ -73,7 +85,9 @@ def _estimate_parser() -> ArgumentParser:
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
     )
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
-    parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz")
+    parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
+    about = "whether RESULT has the load profiles and their bands; auto: up to 1,000 samples"
+    parser.add_argument("--profile", type=str, choices=["auto", "on", "off"], default="auto", help=about)
     parser.add_argument("--plot", type=str, default=None, help="FIGURE.png of the first sample")
     parser.add_argument(
         "--steps",
@@ -89,6 +103,7 @@ def _calibrate_parser() -> ArgumentParser:
     parser = _Parser(description="Mass per length of a robot, from shapes that nothing but gravity and its tendons bends.")
     parser.add_argument("robot", type=str, help="ROBOT.toml with gravity; its mass_per_length is the start, if positive")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz without external load, all of this robot")
+    _units(parser)
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
     parser.add_argument("--youngs-modulus", action="store_true", help="also the stiffness, E and G together; needs tensions")
     parser.add_argument("--tension-offset", action="store_true", help="also one offset (N) per tendon, added to its readings")
@@ -159,10 +174,21 @@ def _dataset_parser() -> ArgumentParser:
     return parser
 
 
+def _import_parser() -> ArgumentParser:
+    parser = _Parser(description="Shapes from a file of a measuring system, in the robot's base frame.")
+    parser.add_argument("format", type=str, choices=IMPORTED, help="what wrote the file; wide: a table with a line for each frame")
+    parser.add_argument("file", type=str, help="the file, as it was exported")
+    parser.add_argument("--robot", type=str, required=True, help="ROBOT.toml")
+    parser.add_argument("--layout", type=str, required=True, help="LAYOUT.toml: which name is what on the robot")
+    parser.add_argument("--out", type=str, required=True, help="SHAPES.csv or .npz")
+    return parser
+
+
 def _plot_parser() -> ArgumentParser:
     parser = _Parser(description="Draw one sample of an estimate.")
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument("shapes", type=str, help="the shapes that were estimated")
+    _units(parser)
     parser.add_argument("result", type=str, help="RESULT.json or .npz of torchrod estimate")
     parser.add_argument("--sample", type=str, default=None, help="which sample; the first by default")
     parser.add_argument("--out", type=str, required=True, help="FIGURE.png")
@@ -180,12 +206,14 @@ COMMANDS = {
     "observability": (_observability_parser, "what markers will see, and where to put them"),
     "simulate": (_simulate_parser, "marker positions from known loads"),
     "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),
+    "import": (_import_parser, "shapes from files of motion capture, trackers and fibres"),
     "plot": (_plot_parser, "a figure of an estimate"),
     "build": (_build_parser, "compile the kernel before it is needed"),
 }
 
 
-HOMES = {"simulate-dataset": "simulate"}  # commands that share a module
+HOMES = {"simulate-dataset": "simulate", "import": "lab_import"}  # commands that share a module, or have a word of Python's as name
+FUNCTIONS = {"import": "lab_import"}
 
 
 def _parser() -> ArgumentParser:
@@ -198,10 +226,10 @@ def _parser() -> ArgumentParser:
 
 
 def _run(options: Namespace) -> None:
-    name = options.subcommand
+    name = str(options.subcommand)
     home = importlib.import_module(f".{HOMES.get(name, name)}", __package__)
     apart(options[name])
-    getattr(home, name.replace("-", "_"))(options[name])
+    getattr(home, FUNCTIONS.get(name, name.replace("-", "_")))(options[name])
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -12,12 +12,12 @@ def plot(options: Namespace) -> None:
     from ..plotting.estimate import draw
 
     robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot)
+    shapes = read_shapes(options.shapes, robot, options.units)
     sample = shapes.samples[0] if options.sample is None else options.sample
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
     writable(options.out, FIGURE_SUFFIXES)
-    fit = read_fit(options.result, sample, robot.name, len(shapes.s), robot.rod.length)
+    fit = read_fit(options.result, sample, robot.name, shapes.groups, robot.rod.length)
     b = shapes.samples.index(sample)
     tension = None if shapes.tension is None else shapes.tension[b]
     draw(options.out, robot, fit, shapes.positions[b], tension, f"{robot.name}, sample {sample}")

@@ -1,16 +1,22 @@
 """Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ), calibrations and what markers see (JSON)."""
 
+from .base_pose import BasePose
 from .calibration_file import CALIBRATION_SUFFIXES, unit_of, write_calibration
 from .observability_file import write_observability, write_observability_table
 from .result_file import RESULT_SUFFIXES, read_fit, write_result
-from .robot_file import read_robot
+from .robot_file import read_base_pose, read_robot
 from .robot_text import write_calibrated
-from .shape_file import Shapes, read_shapes, write_shapes
+from .shape_file import read_shapes, write_shapes
+from .shapes import KINDS, Noises, Shapes
 
 __all__ = [
     "CALIBRATION_SUFFIXES",
+    "KINDS",
     "RESULT_SUFFIXES",
+    "BasePose",
+    "Noises",
     "Shapes",
+    "read_base_pose",
     "read_fit",
     "read_robot",
     "read_shapes",

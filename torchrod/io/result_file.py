@@ -1,5 +1,7 @@
 """RESULT: what the estimate found, as JSON for people and scripts or NPZ for large batches (docs/files.md)."""
 
+import csv
+import io
 import json
 import math
 from collections.abc import Iterator
@@ -16,15 +18,18 @@ from ..analysis.alternatives import Solution
 from ..analysis.count import Evidence
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
+from ..estimation.load_places import LoadPlaces
 from ..estimation.load_profile import Profile
 from ..estimation.result import Estimate, FittedRod
+from ..mechanics.lie import move
 from ..util.errors import InputError, shown
-from ..util.files import put, reading
+from ..util.files import put, put_text, reading
 from ..util.status import Status
+from .base_pose import BasePose
 from .json_file import plain
 from .npz_file import UNREADABLE, why
 
-RESULT_SUFFIXES = (".json", ".npz")
+RESULT_SUFFIXES = (".json", ".npz", ".csv")
 
 
 # What a record is made of: worked out once for the whole batch, and turned to plain numbers once.
@@ -34,10 +39,42 @@ COLUMNS = (
     *("chi2", "dof", "base_wrench", "tip", "registration", "tension", "tension_std"),
 )
 Columns = dict[str, list[Any]]
+WITH_UNITS = {
+    "force_local_N": "force",
+    "magnitude_N": "magnitude",
+    "magnitude_std_N": "magnitude_std",
+    "location_m": "location",
+    "location_std_m": "location_std",
+    "width_m": "width",
+    "rms_residual_m": "rms_residual",
+}
+LOAD_NUMBERS = {name: field for name, field in WITH_UNITS.items() if name not in ("force_local_N", "rms_residual_m")}
 
 
-def _columns(estimate: Estimate) -> Columns:
-    found = {name: getattr(estimate, name) for name in COLUMNS}
+# Of each load, with the units in their names: in RESULT.json, as columns of LOADS.csv and as arrays of RESULT.npz.
+SPACE = ("force_base_N", "position_m", "force_lab_N", "position_lab_m")
+
+
+def _in_space(estimate: Estimate, places: LoadPlaces | None, base: BasePose | None) -> dict[str, Tensor]:
+    """Forces and places (B, K, 3) of all loads: in the robot's base frame and, where that is known, in the lab's.
+
+    An error of the base frame that was estimated has moved the robot in the lab, not in its own frame.
+    """
+    if places is None:
+        return {}
+    force, position = places.force, places.position
+    found = {"force_base_N": force, "position_m": position}
+    if base is not None:
+        zeta = torch.zeros_like(estimate.base_wrench) if estimate.registration is None else estimate.registration
+        turn = torch.cat([torch.zeros_like(zeta[:, :3]), zeta[:, 3:]], -1)
+        found |= {"force_lab_N": base.turned(move(turn, force)), "position_lab_m": base.to_lab(move(zeta, position))}
+        if estimate.tip is not None:
+            found["tip_force_lab_N"] = base.turned(move(turn, estimate.tip[:, None, :3])).squeeze(1)
+    return found
+
+
+def _columns(estimate: Estimate, space: dict[str, Tensor]) -> Columns:
+    found = {name: getattr(estimate, name) for name in COLUMNS} | space
     if estimate.tip_covariance is not None:
         found["tip_std"] = estimate.tip_covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     if bool(estimate.outlier.any()):
@@ -60,6 +97,7 @@ def _loads(of: Columns, b: int) -> list[dict[str, object]]:
             "magnitude_N": of["magnitude"][b][k],
             "location_m": of["location"][b][k],
             "width_m": of["width"][b][k],
+            **{name: of[name][b][k] for name in SPACE if name in of},
             "net_force_local_N": of["net_force"][b][k],
             "covariance": of["magnitude_location_covariance"][b][k],
             "std": {"magnitude_N": of["magnitude_std"][b][k], "location_m": of["location_std"][b][k]},
@@ -101,7 +139,8 @@ def _record(of: Columns, b: int, sample: str, message: str) -> dict[str, str]:
     if "tip_std" in of:
         tip, std = of["tip"][b], of["tip_std"][b]
         spread = {"force_N": std[:3], "moment_Nm": std[3:]}
-        record["tip"] = _numbers({"force_N": tip[:3], "moment_Nm": tip[3:], "std": spread})
+        lab = {"force_lab_N": of["tip_force_lab_N"][b]} if "tip_force_lab_N" in of else {}
+        record["tip"] = _numbers({"force_N": tip[:3], "moment_Nm": tip[3:], **lab, "std": spread})
     if "registration" in of:
         twist = of["registration"][b]
         record["registration"] = _numbers({"translation_m": twist[:3], "rotation_rad": twist[3:]})
@@ -147,11 +186,15 @@ def _texts(
     profile: Profile | None,
     diagnosis: Diagnosis | None,
     noise: Noise | None,
+    space: dict[str, Tensor],
+    time: list[float] | None,
 ) -> Iterator[str]:
     """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
-    of = _columns(estimate)
+    of = _columns(estimate, space)
     for b, name in enumerate(samples):
         record = _record(of, b, name, _message(estimate, diagnosis, b))
+        if time is not None:
+            record["time_s"] = _numbers(time[b])
         if evidence is not None:
             record["evidence"] = json.dumps(_evidence(evidence, b))
         if diagnosis is not None:
@@ -163,6 +206,34 @@ def _texts(
         if profile is not None:
             record["profile"] = _profile(profile, b)
         yield "{\n" + ",\n".join(f' "{key}": {text}' for key, text in record.items()) + "\n}"
+
+
+def _load_table(estimate: Estimate, samples: list[str], space: dict[str, Tensor], time: Tensor | None) -> str:
+    """A row for each load of each sample, the tip's last, and one for a sample without any."""
+    of = _columns(estimate, space)
+    vectors = {"force_local_N": "force", **{name: name for name in SPACE if name in of}}
+    parts = {name: "xyz"[: 2 if name == "force_local_N" else 3] for name in vectors}
+    header = ["time_s", "sample", "status", "accepted", "load", *LOAD_NUMBERS]
+    header += [f"{name.rpartition('_')[0]}_{axis}_{name.rpartition('_')[2]}" for name, axes in parts.items() for axis in axes]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for b, name in enumerate(samples):
+        head = ["" if time is None else float(time[b]), name, Status(of["status"][b]).label, int(of["accepted"][b])]
+        loads = [k for k, v in enumerate(of["location"][b]) if not math.isnan(v)]
+        for k in loads:
+            numbers = [of[field][b][k] for field in LOAD_NUMBERS.values()]
+            numbers += [v for field in vectors.values() for v in of[field][b][k]]
+            writer.writerow([*head, k + 1, *("" if math.isnan(v) else v for v in numbers)])
+        tip = {f"force_base_{axis}_N": v for axis, v in zip("xyz", of["tip"][b], strict=False)} if "tip" in of else {}
+        if tip and not math.isnan(tip["force_base_x_N"]):
+            if "tip_force_lab_N" in of:
+                tip |= {f"force_lab_{axis}_N": v for axis, v in zip("xyz", of["tip_force_lab_N"][b], strict=True)}
+            tip["magnitude_N"] = math.hypot(*of["tip"][b][:3])
+            writer.writerow([*head, "tip", *(tip.get(name, "") for name in header[len(head) + 1 :])])
+        elif not loads:
+            writer.writerow([*head, *[""] * (len(header) - len(head))])
+    return text.getvalue()
 
 
 def _stream(file: IO[bytes], robot: str, texts: Iterator[str]) -> None:
@@ -181,20 +252,28 @@ def write_result(
     profile: Profile | None = None,
     diagnosis: Diagnosis | None = None,
     noise: Noise | None = None,
+    places: LoadPlaces | None = None,
+    base: BasePose | None = None,
+    time: Float[Tensor, " B"] | None = None,
 ) -> None:
-    """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays.
+    """RESULT.json, RESULT.npz with the fields of torchrod.Estimate as arrays, or LOADS.csv with a row for each load.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
+    places: of the loads in space (torchrod.Analysis.places). base: where the robot stands in the lab. time: of the samples (s).
     Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in RESULT_SUFFIXES:
-        raise InputError(f"{path}: results are written as .json or .npz; change the suffix")
+        raise InputError(f"{path}: results are written as .json, .npz or .csv; change the suffix")
     if len(samples) != len(estimate.status):
         raise InputError(f"{path}: {len(samples)} names for {len(estimate.status)} samples; give every sample its name")
+    space = _in_space(estimate, places, base)
+    if path.suffix == ".csv":
+        put_text(path, _load_table(estimate, samples, space, time))
+        return
     if path.suffix == ".json":
-        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise)
+        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, None if time is None else time.tolist())
         put(path, lambda file: _stream(file, json.dumps(robot), texts))
         return
     said, which = np.unique([_message(estimate, diagnosis, b) for b in range(len(samples))], return_inverse=True)
@@ -209,6 +288,7 @@ def write_result(
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
         arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
+    arrays |= space | {name: getattr(estimate, field) for name, field in WITH_UNITS.items()} | {"time_s": time}
     content = names | {k: v.numpy() for k, v in arrays.items() if v is not None}
     # Uncompressed: deflating random digits takes six times as long as estimating them, and saves a third.
     put(path, lambda file: np.savez(file, **content))  # pyright: ignore[reportArgumentType]

@@ -15,9 +15,10 @@ from ..mechanics.rod import Rod, check_stiffness
 from ..mechanics.tendons import Tendon, Tendons
 from ..util.errors import InputError, shown
 from ..util.precision import DTYPE
-from .values import as_number, as_numbers, as_rows, as_table, read_toml
+from .base_pose import BasePose, as_base_pose
+from .values import as_number, as_numbers, as_rows, as_table, in_si, read_toml
 
-TOP_KEYS = {"name", "rod", "tendons"}
+TOP_KEYS = {"name", "rod", "tendons", "base"}
 KINDS = {"round": ("diameter", "inner_diameter"), "oval": ("axes", "angle"), "stiffness": ("K_se", "K_bt")}  # of a section
 MODULI = ("youngs_modulus", "shear_modulus")
 SECTION_KEYS = (*KINDS["round"], *KINDS["oval"], *KINDS["stiffness"], *MODULI)
@@ -26,7 +27,10 @@ MASS_KEYS = {"s", "mass"}
 SOFTEST, HARDEST = 1e4, 2e12  # Pa: below the softest silicone and above diamond
 RUBBER, SLENDER = 1e6, 1 / 40  # Pa, and a diameter over the length: so soft and so slender a rod does not hold itself
 MOST_COILS = 200  # turns of the unloaded rod
-TENDON_KEYS = {"offset", "routing", "ends_at", "tension_offset", "friction", "motion"}
+ROD_LENGTHS = {"length", "diameter", "inner_diameter", "axes"}
+SECTION_LENGTHS = {"to", "diameter", "inner_diameter", "axes"}
+TENDON_LENGTHS = {"offset", "routing", "ends_at", "radius"}
+TENDON_KEYS = TENDON_LENGTHS | {"angle", "tension_offset", "friction", "motion"}
 MOTIONS = {"pull": 1.0, "release": -1.0}
 
 
@@ -178,7 +182,9 @@ def _pieces(where: str, table: dict[str, Any], length: float) -> tuple[list[Piec
     pieces, start, own_rows = [], 0.0, False
     for i, value in enumerate(listed):
         here = f"{where}.sections[{i}]"
-        own = as_table(here, value, {"to", "mass_per_length", "reference_curvature", *SECTION_KEYS})
+        own = as_table(
+            here, in_si(here, value, SECTION_LENGTHS, {"angle"}), {"to", "mass_per_length", "reference_curvature", *SECTION_KEYS}
+        )
         last = i == len(listed) - 1
         if "to" not in own and not last:
             raise InputError(f"{here}.to is missing; give the arc length in metres at which the section ends")
@@ -222,7 +228,7 @@ def _masses(where: str, value: object, length: float) -> torch.Tensor:
         raise InputError(f"{where} must be an array of tables, [[rod.masses]]")
     rows = []
     for i, entry in enumerate(value):
-        table = as_table(f"{where}[{i}]", entry, MASS_KEYS)
+        table = as_table(f"{where}[{i}]", in_si(f"{where}[{i}]", entry, {"s"}), MASS_KEYS)
         for key in sorted(MASS_KEYS):
             if key not in table:
                 raise InputError(f"{where}[{i}].{key} is missing; give s (m) and mass (kg)")
@@ -261,14 +267,19 @@ def _motion(where: str, value: object) -> float:
 
 
 def _tendon(where: str, value: object, length: float) -> Tendon:
-    table = as_table(where, value, TENDON_KEYS)
-    if ("offset" in table) == ("routing" in table):
-        raise InputError(f"{where} needs either offset = [x, y] or routing = [[s, x, y], ...], in metres")
+    table = as_table(where, in_si(where, value, TENDON_LENGTHS, {"angle"}), TENDON_KEYS)
+    if ("radius" in table) != ("angle" in table):
+        raise InputError(f"{where}.{'radius' if 'angle' in table else 'angle'} is missing; radius and angle are given together")
+    if sum(key in table for key in ("offset", "routing", "radius")) != 1:
+        raise InputError(f"{where} needs either offset = [x, y] or routing = [[s, x, y], ...], in metres, or radius and angle")
     ends_at = as_number(f"{where}.ends_at", table.get("ends_at", length), positive=True)
     if ends_at > length * (1 + 1e-9):
         raise InputError(f"{where}.ends_at is {ends_at} m, beyond the rod's length of {length} m")
     correction = as_number(f"{where}.tension_offset", table.get("tension_offset", 0.0))
-    if "offset" in table:
+    if "radius" in table:
+        radius, angle = (as_number(f"{where}.{key}", table[key]) for key in ("radius", "angle"))
+        tendon = Tendon.straight(radius * math.cos(angle), radius * math.sin(angle), ends_at, correction)
+    elif "offset" in table:
         x, y = as_numbers(f"{where}.offset", table["offset"], 2)
         tendon = Tendon.straight(x, y, ends_at, correction)
     else:
@@ -290,16 +301,30 @@ def read_robot(path: str | Path) -> Robot:
     return robot_of(Path(path), read_toml(Path(path)))
 
 
+def read_base_pose(path: str | Path) -> BasePose | None:
+    """Where [base] of a ROBOT.toml puts the robot in the lab; None where it does not say. Errors: InputError."""
+    return base_pose_of(Path(path), read_toml(Path(path)))
+
+
+def base_pose_of(path: Path, content: dict[str, Any]) -> BasePose | None:
+    """The same from what a ROBOT.toml says."""
+    if "base" not in content:
+        return None
+    where = f"{path}: base"
+    return as_base_pose(where, in_si(where, content["base"], {"position"}, {"rotation"}))
+
+
 def robot_of(path: Path, content: dict[str, Any]) -> Robot:
     """The same from what a ROBOT.toml says; path: what refusals call it."""
     if "rod" not in content:
         raise InputError(f"{path}: has no [rod] table; give at least length, diameter, youngs_modulus and shear_modulus")
     as_table(str(path), content, TOP_KEYS)
-    table = as_table(f"{path}: rod", content["rod"], ROD_KEYS)
+    table = as_table(f"{path}: rod", in_si(f"{path}: rod", content["rod"], ROD_LENGTHS, {"angle"}), ROD_KEYS)
     rod = _rod(path, table)
     gravity = torch.tensor(as_numbers(f"{path}: rod.gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3), dtype=DTYPE)
     if bool(gravity.any()) and rod.mass == 0:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
+    base_pose_of(path, content)
     name = content.get("name", path.stem)
     if not isinstance(name, str):
         raise InputError(f"{path}: name is {shown(name)}; it must be a text in quotes")

@@ -1,56 +1,47 @@
-"""SHAPES: measured marker positions, CSV or NPZ. Every refusal is one sentence with file, place and remedy."""
+"""SHAPES: what was measured, CSV or NPZ. Every refusal is one sentence with file, place and remedy."""
 
 import csv
 import io
 import math
 import re
 import warnings
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mechanics.grid import on_rod
 from ..mechanics.robot import Robot
 from ..model.marker_geometry import at_origin, too_far, too_short
-from ..model.sensors import Markers
-from ..util.errors import InputError, shown
+from ..util.errors import InputError
 from ..util.files import put, reading
-from ..util.precision import Float64
+from ..util.units import metres_per
+from .csv_file import Table, read_table
 from .npz_file import UNREADABLE, read_arrays, why
+from .shapes import KINDS, Kind, Of, Shapes
 
-REQUIRED = ("s", "x", "y", "z")
-OFFSETS = ("rx", "ry", "rz")
+COLUMNS = ("sample", "time", "s", *(name for kind in KINDS for name in kind.columns))
+TENSION_EXAMPLES = ("tension_1", "tension_2")
+POSITIONS, OFFSETS = KINDS[0], KINDS[1]
+TENSION = re.compile(r"tension_\d+", re.ASCII)
+UNITS = re.compile(r"""\s*units\s*[=:]\s*["']?([^"']*?)["']?\s*""", re.IGNORECASE)
 SLACK = 0.05  # of the largest tension in the file: a load cell's zero may drift by so much
-DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*", re.ASCII)
+UNIT_QUATERNION = 1e-2
+ALIKE = 0.85  # of difflib: one letter more or less in a word
+LEAST_COLUMNS = 2  # known ones, in a line that is a header
 
 
-@dataclass(frozen=True)
-class Shapes(Float64):
-    """Marker positions of B named samples, as a file holds them; their noise is not in it.
+def read_shapes(path: str | Path, robot: Robot, units: str | None = None) -> Shapes:
+    """Measurements from a CSV or NPZ file (docs/files.md), checked against the robot.
 
-    s: (P,) m. positions: (B, P, 3) m, base frame, NaN where missing. samples: their names. offsets: (P, 3) m, from the centre line
-    in the section frame. tension: (B, T) N, readings of the load cells.
+    units: of its lengths, as metres_per takes it; by default what a remark of the file says, else metres. Errors: InputError naming
+    file and remedy.
     """
-
-    s: Float[Tensor, " P"]
-    positions: Float[Tensor, "B P 3"]
-    samples: list[str]
-    offsets: Float[Tensor, "P 3"] | None = None
-    tension: Float[Tensor, "B T"] | None = None
-
-    def markers(self, noise: float | Float[Tensor, " B"]) -> Markers:
-        """The sensor, with the standard deviation of a coordinate (m), one for all samples or one for each."""
-        return Markers(self.s, self.positions, noise, self.offsets)
-
-
-def read_shapes(path: str | Path, robot: Robot) -> Shapes:
-    """Markers from a CSV or NPZ file (docs/files.md), checked against the robot. Errors: InputError naming file and remedy."""
     path = Path(path)
     with reading(path):
         if "\0" in str(path) or not path.is_file():
@@ -58,12 +49,13 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
         with path.open("rb") as file:
-            shapes = _read_npz(path, file) if path.suffix == ".npz" else _read_csv(path, file)
+            shapes = _read_npz(path, file, units) if path.suffix == ".npz" else _read_csv(path, file, units)
+    _check_rotations(path, shapes)
     gap, L = at_origin(shapes.markers(1.0)), robot.rod.length
     markers = replace(shapes, positions=torch.where(gap.unsqueeze(-1), torch.nan, shapes.positions))
     outside = ~on_rod(markers.s, L)
     if bool(outside.any()):
-        hint = "is it in millimetres? give metres" if float(markers.s.max()) > 30 * L else "s is in metres"
+        hint = "is it in millimetres? give metres, or --units mm" if float(markers.s.max()) > 30 * L else "s is in metres"
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
     if said := too_short(markers.s, L) or too_far(markers.markers(1.0), L):
         raise InputError(f"{path}: {said}")
@@ -77,6 +69,22 @@ def read_shapes(path: str | Path, robot: Robot) -> Shapes:
     if bool(gap.any()):
         _warn_of_gaps(path, gap, markers.s)
     return replace(markers, s=markers.s.clamp(0, L))
+
+
+def _check_rotations(path: Path, shapes: Shapes) -> None:
+    """Quaternions of length 1, to what a file rounds them to."""
+    q = shapes.readings.get("orientations")
+    off = None if q is None else (q.norm(dim=-1) - 1).abs()
+    if q is not None and off is not None and bool((off > UNIT_QUATERNION).any()):
+        size = float(q.norm(dim=-1)[off > UNIT_QUATERNION][0])
+        raise InputError(f"{path}: qx,qy,qz,qw have the length {size:.3g}; a rotation is a unit quaternion, give it as such")
+
+
+def _scale(path: Path, asked: str | None, stated: str | None) -> float:
+    """Metres in the file's unit of length."""
+    if asked is not None and stated is not None and metres_per("--units", asked) != metres_per(f"{path}: units", stated):
+        raise InputError(f"{path}: says units = {stated!r} but --units is {asked}; give one of them, or correct the file")
+    return metres_per("--units", asked) if asked is not None else metres_per(f"{path}: units", stated or "m")
 
 
 def _warn_of_gaps(path: Path, gap: Bool[Tensor, "B P"], s: Float[Tensor, " P"]) -> None:
@@ -127,161 +135,233 @@ def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: s
         )
 
 
-def _read_npz(path: Path, file: IO[bytes]) -> Shapes:
+# NPZ.
+
+
+def _expected(P: int | None, B: int | None) -> dict[str, tuple[int | str | None, ...]]:
+    """The shape of every array that is known, with the letters of docs/files.md where a number is not known or any will do."""
+    shapes: dict[str, tuple[int | str | None, ...]] = {"s": (P or "P",), "time": (B or "B",), "sample": (B or "B",), "units": ()}
+    shapes["tensions"] = (B or "B", "T")
+    for kind in KINDS:
+        of = {Of.MARKER: (B or "B", P or "P"), Of.PLACE: (P or "P",), Of.SAMPLE: (B or "B",)}[kind.of]
+        shapes[kind.name] = (*of, *((len(kind.columns),) if len(kind.columns) > 1 else ()))
+    return shapes
+
+
+def _read_npz(path: Path, file: IO[bytes], units: str | None) -> Shapes:
     try:
         data = read_arrays(file)
     except UNREADABLE as error:
         raise InputError(f"{path}: is not an NPZ of plain numbers ({why(error)}); save numeric arrays only") from None
-    expected = {"s": "(P,)", "positions": "(B, P, 3)", "tensions": "(B, T)", "offsets": "(P, 3)"}
+    if unknown := [key for key in data if key not in _expected(None, None)]:
+        _ignored(path, "array", unknown, list(_expected(None, None)))
+    data = {key: value for key, value in data.items() if key not in unknown}
+    texts = {key: data.pop(key) for key in ("sample", "units") if key in data}
     for key, value in data.items():
-        if key not in expected:
-            raise InputError(f"{path}: unknown array '{key}'; known: {', '.join(expected)}")
         if not (np.issubdtype(value.dtype, np.floating) or np.issubdtype(value.dtype, np.integer)):
             raise InputError(f"{path}: array '{key}' does not hold numbers; save it as float64")
-    for key in ("s", "positions"):
-        if key not in data:
-            raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
+    given = [kind for kind in KINDS if kind.name in data and kind.of is not Of.PLACE]
+    if "s" not in data or not given:
+        key = "s" if "s" not in data else "positions"
+        raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
     data = {key: value.astype(np.float64) for key, value in data.items()}
-    P, B = data["s"].size, len(data["positions"]) if data["positions"].ndim else 0
-    if not P or not data["positions"].size:
+    first = data[given[0].name]
+    P, B = data["s"].size, len(first) if first.ndim else 0
+    if not P or not first.size:
         raise InputError(f"{path}: holds no marker; give at least one in s (P,) and one sample of it in positions (B, P, 3)")
-    shapes = {
-        "s": (P,),
-        "positions": (B, P, 3),
-        "tensions": (B, *data.get("tensions", np.empty((0, 0))).shape[1:2]),
-        "offsets": (P, 3),
-    }
+    named, wanted = _expected(None, None), _expected(P, B)
+    for key, value in (data | texts).items():
+        if len(value.shape) != len(wanted[key]) or any(w not in ("T", n) for w, n in zip(wanted[key], value.shape, strict=True)):
+            form = f"({', '.join(map(str, named[key]))}{',' * (len(named[key]) == 1)})"
+            raise InputError(f"{path}: array '{key}' has shape {value.shape}; expected {form} with P = {P} and B = {B}")
     for key, value in data.items():
-        if value.shape != shapes[key]:
-            raise InputError(f"{path}: array '{key}' has shape {value.shape}; expected {expected[key]} with P = {P} and B = {B}")
-        if np.isinf(value).any() or (key in ("s", "offsets") and np.isnan(value).any()):
+        if np.isinf(value).any() or (key in ("s", "offsets", "time") and np.isnan(value).any()):
             raise InputError(
                 f"{path}: array '{key}' holds a value that is not finite; only positions may be NaN (a missing marker)"
             )
     _increasing(path, data["s"], data.get("offsets"), "all")
-    tensor = {key: torch.from_numpy(value) for key, value in data.items()}
-    names = [str(i) for i in range(B)]
-    return Shapes(tensor["s"], tensor["positions"], names, tensor.get("offsets"), tensor.get("tensions"))
+    scale = _scale(path, units, str(texts["units"]) if "units" in texts else None)
+    names = [str(name) for name in texts["sample"]] if "sample" in texts else [str(i) for i in range(B)]
+    lengths = {"s"} | {kind.name for kind in KINDS if kind.length}
+    found = {key: torch.from_numpy(value * scale if key in lengths and scale != 1.0 else value) for key, value in data.items()}
+    readings = {k.name: found[k.name] if len(k.columns) > 1 else found[k.name].unsqueeze(-1) for k in _further(found)}
+    positions = found.get("positions", torch.full((B, P, 3), torch.nan, dtype=torch.float64))
+    return Shapes(found["s"], positions, names, found.get("offsets"), found.get("tensions"), found.get("time"), readings)
 
 
-def _without_comments(lines: Iterable[str], comments: list[str]) -> Iterator[str]:
-    """The lines, those that begin with # emptied and collected; not within quotes, where a line goes on."""
-    quoted = False
-    for line in lines:
-        if not quoted and line.lstrip().startswith("#"):
-            comments.append(line.lstrip()[1:])
-            yield "\n"  # a line all the same: refusals count them
-            continue
-        quoted ^= line.count('"') % 2 == 1
-        yield line
+def _further(found: dict[str, Tensor]) -> list[Kind]:
+    """The kinds that have no field of their own in Shapes."""
+    return [kind for kind in KINDS if kind.name in found and kind not in (POSITIONS, OFFSETS)]
 
 
-def _delimiter(header: str) -> str:
-    """Of a CSV, by its header: a comma, or what spreadsheets put where the comma is the decimal mark."""
-    return next((mark for mark in (",", ";", "\t") if mark in header), ",")
+def _ignored(path: Path, what: str, unknown: list[str], known: list[str]) -> None:
+    """Say once what is left aside; refuse what looks like a slip of the pen, which would lose a measurement."""
+    for name in unknown:
+        if near := get_close_matches(name.strip().lower(), known, 1, ALIKE):
+            raise InputError(f"{path}: unknown {what} '{name.strip()[:40]}'; call it '{near[0]}', or something quite different")
+    names = ", ".join(f"'{name.strip()[:40]}'" for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
+    warnings.warn(
+        f"{path}: {what}{'s' * (len(unknown) > 1)} {names} {'are' if unknown[1:] else 'is'} not known and ignored; "
+        f"known: {','.join(known)}",
+        stacklevel=4,
+    )
+
+
+# CSV.
 
 
 def _names(cells: list[str]) -> list[str]:
     return [name.strip().lower() for name in cells]
 
 
-def _rows(path: Path, file: IO[bytes]) -> tuple[list[tuple[int, list[str]]], bool]:
-    """The numbered rows of cells, header first, and whether a comma is their decimal mark."""
-    comments: list[str] = []
-    try:
-        text = file.read().decode("utf-8-sig")
-        lines = list(_without_comments(io.StringIO(text, newline=""), comments))
-        first = next((line for line in lines if line.strip()), "")
-        mark, header = _delimiter(first), None
-        reader = csv.reader(lines, delimiter=mark)
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-        if comments and not set(REQUIRED) <= set(_names(rows[0][1] if rows else [])):  # as numpy.savetxt puts a header
-            header = next((c for c in comments if set(REQUIRED) <= set(_names(next(csv.reader([c], delimiter=mark), [])))), None)
-    except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path}: is not a CSV text file; expected the header s,x,y,z") from None
-    if header is not None:
-        rows.insert(0, (0, next(csv.reader([header], delimiter=mark))))
-    return rows, mark != ","
+def _is_header(cells: list[str]) -> bool:
+    names = set(_names(cells))
+    return "s" in names and len(names & {*COLUMNS}) >= LEAST_COLUMNS
 
 
-def _read_csv(path: Path, file: IO[bytes]) -> Shapes:
-    numbered, comma = _rows(path, file)
-    header = _names(numbered[0][1]) if numbered else []
-    _check_header(path, header)
-    if len(numbered) < 2:
+def _stated_units(remarks: list[str]) -> str | None:
+    return next((match[1] for remark in remarks if (match := UNITS.fullmatch(remark.rstrip("\r\n")))), None)
+
+
+def _read_csv(path: Path, file: IO[bytes], units: str | None) -> Shapes:
+    table = read_table(path, file, _is_header)
+    names = _names(table.header)
+    kinds, tensions = _check_header(path, names)
+    if not table.rows:
         raise InputError(f"{path}: has a header but no rows; give one row per marker")
-    samples: dict[str, list[dict[str, float]]] = {}
-    for number, row in numbered[1:]:
-        if len(row) != len(header):
-            raise InputError(
-                f"{path}: line {number} has {len(row)} cells, the header {len(header)}; leave a missing marker's cells empty"
+    scale = _scale(path, units, _stated_units(table.remarks))
+    samples, which = _samples_of(table, names)
+    s = _finite(table, names, "s") * scale
+    columns = {kind.name: np.stack([_column(table, names, kind, key) for key in kind.columns], -1) for kind in kinds}
+    columns = {kind.name: columns[kind.name] * (scale if kind.length else 1.0) for kind in kinds}
+    offsets = columns.get(OFFSETS.name)
+    order = np.argsort(which, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(which[order])) + 1):
+        _increasing(path, s[rows], None if offsets is None else offsets[rows], samples[which[rows[0]]])
+    places, index = np.unique(s[:, None] if offsets is None else np.column_stack([s, offsets]), axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    found: dict[str, Tensor] = {}
+    for kind in kinds:
+        if kind.of is Of.MARKER:
+            whole = np.full((len(samples), len(places), len(kind.columns)), math.nan)
+            whole[which, index] = columns[kind.name]
+        elif kind.of is Of.SAMPLE:
+            whole = np.stack(
+                [_once(table, samples, which, v, key) for v, key in zip(columns[kind.name].T, kind.columns, strict=True)], -1
             )
-        cells = dict(zip(header, row, strict=True))
-        name = cells.pop("sample", "0").strip()
-        samples.setdefault(name, []).append({key: _cell(path, number, key, text, comma) for key, text in cells.items()})
-    return _assemble(path, header, samples)
+        else:
+            continue
+        found[kind.name] = torch.from_numpy(whole)
+    time = _once(table, samples, which, _finite(table, names, "time"), "time") if "time" in names else None
+    pulls = [_once(table, samples, which, _finite(table, names, key), key) for key in tensions]
+    positions = found.pop("positions", torch.full((len(samples), len(places), 3), torch.nan, dtype=torch.float64))
+    return Shapes(
+        torch.from_numpy(places[:, 0].copy()),
+        positions,
+        samples,
+        None if offsets is None else torch.from_numpy(places[:, 1:].copy()),
+        torch.from_numpy(np.stack(pulls, -1)) if pulls else None,
+        None if time is None else torch.from_numpy(time),
+        found,
+    )
 
 
-def _check_header(path: Path, header: list[str]) -> None:
-    tensions = [f"tension_{i + 1}" for i in range(sum(name.startswith("tension_") for name in header))]
-    known = {*REQUIRED, *OFFSETS, "sample", *tensions}
-    for name in REQUIRED:
-        if name not in header:
-            raise InputError(f"{path}: column '{name}' is missing; the header starts with s,x,y,z")
-    for name in header:
-        if name not in known or header.count(name) > 1:
-            raise InputError(
-                f"{path}: unexpected column '{name[:80]}'; known: s,x,y,z,sample,rx,ry,rz and tension_1..tension_T, once each"
-            )
-    if 0 < sum(name in header for name in OFFSETS) < 3:
-        raise InputError(f"{path}: rx,ry,rz come together; add the missing one of them")
-
-
-def _cell(path: Path, line: int, key: str, text: str, comma: bool) -> float:
-    """A number; an empty cell or NaN is a missing one, which only a position may be. comma: it may be the decimal mark."""
-    if comma and DECIMAL_COMMA.fullmatch(text):
-        text = text.replace(",", ".")
-    try:
-        value = float(text) if text.strip() else math.nan
-    except ValueError:
-        raise InputError(f"{path}: line {line}, column {key}: {shown(text.strip())} is not a number") from None
-    if not math.isfinite(value) and (key not in "xyz" or math.isinf(value)):
+def _check_header(path: Path, names: list[str]) -> tuple[list[Kind], list[str]]:
+    """The kinds of measurement that there are, and the tensions' columns in their order."""
+    if "s" not in names:
+        raise InputError(f"{path}: column 's' is missing; the header starts with s,x,y,z")
+    known = [*COLUMNS, *(name for name in names if TENSION.fullmatch(name))]
+    for name in names:
+        if name in known and names.count(name) > 1:
+            raise InputError(f"{path}: column '{name}' stands twice in the header; keep one of them")
+    if unknown := [name for name in names if name not in known]:
+        _ignored(path, "column", unknown, [*COLUMNS, *TENSION_EXAMPLES])
+    kinds = []
+    for kind in KINDS:
+        there = [name for name in kind.columns if name in names]
+        if there and len(there) < len(kind.columns):
+            missing = next(name for name in kind.columns if name not in there)
+            raise InputError(f"{path}: column '{missing}' is missing; {','.join(kind.columns)} come together")
+        if there:
+            kinds.append(kind)
+    if not any(kind.of is Of.MARKER and kind.name != "position_std" for kind in kinds):
+        raise InputError(f"{path}: column 'x' is missing; the header starts with s,x,y,z")
+    tensions = sorted((name for name in names if TENSION.fullmatch(name)), key=lambda name: int(name[8:]))
+    wanted = [f"tension_{i + 1}" for i in range(len(tensions))]
+    if tensions != wanted:
         raise InputError(
-            f"{path}: line {line}, column {key}: must be a finite number; only x, y, z may be empty (a missing marker)"
+            f"{path}: columns {', '.join(tensions)}; number the tendons tension_1..tension_{len(tensions)} without a gap"
         )
-    return value
+    return kinds, tensions
 
 
-def _assemble(path: Path, header: list[str], samples: dict[str, list[dict[str, float]]]) -> Shapes:
-    """One marker list for all samples, in the order of s; a marker that a sample does not have is missing there."""
-    has_offsets = OFFSETS[0] in header
-    keys = ("s", *OFFSETS) if has_offsets else ("s",)
-    tensions = [f"tension_{i + 1}" for i in range(sum(name.startswith("tension_") for name in header))]
-    for name, rows in samples.items():
-        at = np.array([[row[k] for k in keys] for row in rows])
-        _increasing(path, at[:, 0], at[:, 1:] if has_offsets else None, name)
-        if any(row[t] != rows[0][t] for row in rows for t in tensions):
-            raise InputError(f"{path}: sample {name}: the tensions differ from row to row; one sample is one state of the robot")
-    places = sorted({tuple(row[k] for k in keys) for rows in samples.values() for row in rows})
-    index = {place: i for i, place in enumerate(places)}
-    positions = torch.full((len(samples), len(places), 3), math.nan, dtype=torch.float64)
-    for b, rows in enumerate(samples.values()):
-        for row in rows:
-            positions[b, index[tuple(row[k] for k in keys)]] = torch.tensor([row[k] for k in "xyz"], dtype=torch.float64)
-    table = torch.tensor(places, dtype=torch.float64)
-    tension = torch.tensor([[rows[0][t] for t in tensions] for rows in samples.values()], dtype=torch.float64) if tensions else None
-    return Shapes(table[:, 0].contiguous(), positions, list(samples), table[:, 1:].contiguous() if has_offsets else None, tension)
+def _samples_of(table: Table, names: list[str]) -> tuple[list[str], Int[np.ndarray, " rows"]]:
+    """The samples' names in the order of the file, and which of them every row is of: by name, or else by time."""
+    key = "sample" if "sample" in names else "time" if "time" in names else None
+    if key is None:
+        return ["0"], np.zeros(len(table.rows), dtype=np.int64)
+    index: dict[str, int] = {}
+    which = np.array([index.setdefault(name, len(index)) for name in table.texts(names.index(key))])
+    return list(index), which
+
+
+def _finite(table: Table, names: list[str], key: str) -> Float[np.ndarray, " rows"]:
+    """A column of which every row must have a number."""
+    values = table.numbers(names.index(key))
+    _refuse(table, key, ~np.isfinite(values))
+    return values
+
+
+def _column(table: Table, names: list[str], kind: Kind, key: str) -> Float[np.ndarray, " rows"]:
+    """A column of measurements: NaN where there is none, but not of what all samples share."""
+    values = table.numbers(names.index(key))
+    _refuse(table, key, ~np.isfinite(values) if kind.of is Of.PLACE else np.isinf(values))
+    return values
+
+
+def _refuse(table: Table, key: str, bad: Bool[np.ndarray, " rows"]) -> None:
+    if bad.any():
+        line = table.lines[int(np.flatnonzero(bad)[0])]
+        raise InputError(
+            f"{table.path}: line {line}, column {key}: must be a finite number; only x, y, z may be empty (a missing marker)"
+        )
+
+
+def _once(
+    table: Table, samples: list[str], which: Int[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], key: str
+) -> Float[np.ndarray, " B"]:
+    """What is of a whole sample: the same in all of its rows that have it, NaN where none has."""
+    found = np.full(len(samples), math.nan)
+    there = np.flatnonzero(np.isfinite(values))
+    found[which[there]] = values[there]
+    differs = there[found[which[there]] != values[there]]
+    if differs.size:
+        name = samples[which[differs[0]]]
+        what = "the tensions differ" if key.startswith("tension") else f"{key} differs"
+        raise InputError(f"{table.path}: sample {name}: {what} from row to row; one sample is one state of the robot")
+    return found
 
 
 def write_shapes(path: str | Path, shapes: Shapes) -> None:
-    """Markers as a CSV with the header of the contract, every digit kept; a missing marker has empty cells. Errors: InputError."""
-    markers = shapes
-    if len(shapes.samples) != len(markers.positions):
-        raise InputError(f"{path}: {len(shapes.samples)} names for {len(markers.positions)} samples; give every sample its name")
-    tensions = [] if markers.tension is None else [f"tension_{i + 1}" for i in range(markers.tension.shape[-1])]
-    header = ["sample", *REQUIRED, *([] if markers.offsets is None else OFFSETS), *tensions]
-    places = markers.s.tolist()
-    offsets = [[]] * len(places) if markers.offsets is None else markers.offsets.tolist()
+    """Measurements as an NPZ, or as a CSV with the header of docs/files.md; every digit is kept, and a missing number is an empty
+    cell. Errors: InputError.
+    """
+    path = Path(path)
+    if len(shapes.samples) != len(shapes.positions):
+        raise InputError(f"{path}: {len(shapes.samples)} names for {len(shapes.positions)} samples; give every sample its name")
+    if path.suffix == ".npz":
+        content: dict[str, Tensor | None] = {"s": shapes.s, "positions": shapes.positions, "offsets": shapes.offsets}
+        content |= {"tensions": shapes.tension, "time": shapes.time}
+        content |= {name: v.squeeze(-1) if v.shape[-1] == 1 else v for name, v in shapes.readings.items()}
+        arrays = {name: value.numpy() for name, value in content.items() if value is not None}
+        put(path, lambda file: np.savez(file, sample=np.array(shapes.samples), **arrays))  # pyright: ignore[reportArgumentType]
+        return
+    kinds = [kind for kind in KINDS if kind is POSITIONS or kind.name in shapes.readings]
+    kinds += [OFFSETS] if shapes.offsets is not None else []
+    tensions = [] if shapes.tension is None else [f"tension_{i + 1}" for i in range(shapes.tension.shape[-1])]
+    time = [] if shapes.time is None else ["time"]
+    header = ["sample", *time, "s", *(name for kind in kinds for name in kind.columns), *tensions]
+    places = shapes.s.tolist()
 
     def write(file: IO[bytes]) -> None:
         for b in range(-1, len(shapes.samples)):
@@ -291,13 +371,24 @@ def write_shapes(path: str | Path, shapes: Shapes) -> None:
                 writer.writerow(header)
             else:
                 name = _quoted(shapes.samples[b])
-                tension = [] if markers.tension is None else markers.tension[b].tolist()
-                for s, p, offset in zip(places, markers.positions[b].tolist(), offsets, strict=True):
+                at = [] if shapes.time is None else [shapes.time[b].item()]
+                tension = [] if shapes.tension is None else shapes.tension[b].tolist()
+                cells = torch.cat([_of_sample(shapes, kind, b) for kind in kinds], -1)
+                for s, row in zip(places, cells.tolist(), strict=True):
                     text.write(name + ",")
-                    writer.writerow([s, *("" if math.isnan(v) else v for v in p), *offset, *tension])
+                    writer.writerow([*at, s, *("" if math.isnan(v) else v for v in row), *tension])
             file.write(text.getvalue().encode())
 
     put(path, write)
+
+
+def _of_sample(shapes: Shapes, kind: Kind, b: int) -> Float[Tensor, "P k"]:
+    """The cells of a kind in the rows of one sample."""
+    if kind is OFFSETS:
+        assert shapes.offsets is not None
+        return shapes.offsets
+    values = shapes.positions[b] if kind is POSITIONS else shapes.readings[kind.name][b]
+    return values.expand(len(shapes.s), -1) if kind.of is Of.SAMPLE else values
 
 
 def _quoted(name: str) -> str:

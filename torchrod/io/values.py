@@ -2,12 +2,15 @@
 
 import math
 import tomllib
+from collections.abc import Collection
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from ..util.errors import InputError, shown
 from ..util.files import reading
+
+MOST_WHOLE = 10**300  # a whole number beyond it has no float
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -27,6 +30,30 @@ def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
         if key not in known:
             raise InputError(f"{where}: unknown key '{key}'; known keys: {', '.join(sorted(known))}")
     return value
+
+
+def in_si(where: str, value: object, lengths: Collection[str], angles: Collection[str] = ()) -> object:
+    """A table with its keys NAME_mm and NAME_deg as NAME, in m and rad. Errors: InputError where a key stands in two units."""
+    if not isinstance(value, dict):
+        return value
+    table: dict[str, Any] = {}
+    for key, content in value.items():
+        stem, _, unit = key.rpartition("_")
+        factor = 1e-3 if unit == "mm" and stem in lengths else math.pi / 180 if unit == "deg" and stem in angles else None
+        name = key if factor is None else stem
+        if name in table or (factor is not None and stem in value):
+            raise InputError(f"{where}.{name} is given in two units; keep one of them")
+        table[name] = content if factor is None else _times(factor, content)
+    return table
+
+
+def _times(factor: float, value: object) -> object:
+    """Numbers in however deep a list, multiplied; anything else as it is, to be refused where it is read."""
+    if isinstance(value, list):
+        return [_times(factor, v) for v in value]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return value
+    return factor * value if isinstance(value, float) or abs(value) < MOST_WHOLE else value
 
 
 def as_number(where: str, value: object, positive: bool = False, least: float = -math.inf) -> float:

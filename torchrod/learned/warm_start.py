@@ -123,9 +123,13 @@ def _costs(problem: Problem, x: Float[Tensor, "B k n"], p: Float[Tensor, "B k P 
     markers = problem.markers
     assert markers is not None
     square = (markers.positions.unsqueeze(1) - p).square().sum(-1)
+    own = markers.deviation
+    own = own * own
+    if isinstance(own, Tensor) and own.shape[-1] > 1:  # each marker has its own
+        square, own = square / own.unsqueeze(1), 1.0
     seen = torch.where(markers.present.unsqueeze(1), square, 0.0).sum(-1)
     mean, precision = problem.mean.unsqueeze(-2), problem.precision.unsqueeze(-2)
-    return seen / markers.deviation**2 + (precision * (mean - x) ** 2).sum(-1)
+    return seen / own + (precision * (mean - x) ** 2).sum(-1)
 
 
 RANGES = ("amp", "noise_over_length", "markers_seen", "shear_over_bending", "torsion_over_bending")

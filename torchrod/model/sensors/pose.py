@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...mechanics.lie import Matrix, Vector, conjugate, logarithm, matvec, product, rotate
 from ...util.precision import Float64
-from .sensor import RodState, as_numbers, check_noise, check_units, rows_of, shape_error, variance
+from .sensor import RodState, as_numbers, check_noise, check_units, noise_shape, rows_of, shape_error, variance
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,9 @@ class Poses(Float64):
 
     s: (P,) m. positions: (B, P, 3) m and orientations: (B, P, 4), unit quaternions (x, y, z, w), both in the base frame, NaN where
     missing: either may be missing alone. noise (m) and angle_noise (rad): standard deviations of a coordinate and of each component
-    of the rotation vector of the orientation's error, one number or one for each sample (B,). offsets: (P, 3) m, r in the section
-    frame. mounting: (P, 4), R_r, the sensor's axes in the section frame; None: they are the section's.
+    of the rotation vector of the orientation's error, one number, one for each sample (B,) or one for each sensor
+    (B, P). offsets: (P, 3) m, r in the section frame. mounting: (P, 4), R_r, the sensor's axes in the section frame; None: they are
+    the section's.
 
     The rows of the orientation are the deviation from what was read, Log(R_measured^T R(s) R_r) (rad), so that their reading is 0.
     Errors: ValueError of `check`. Source: J. Sola et al., A micro Lie theory for state estimation in robotics, 2018, (44).
@@ -27,8 +28,8 @@ class Poses(Float64):
     s: Float[Tensor, " P"]
     positions: Float[Tensor, "B P 3"]
     orientations: Float[Tensor, "B P 4"]
-    noise: float | Float[Tensor, " B"]
-    angle_noise: float | Float[Tensor, " B"]
+    noise: float | Float[Tensor, " B"] | Float[Tensor, "B P"]
+    angle_noise: float | Float[Tensor, " B"] | Float[Tensor, "B P"]
     offsets: Float[Tensor, "P 3"] | None = None
     mounting: Float[Tensor, "P 4"] | None = None
 
@@ -98,7 +99,8 @@ class Poses(Float64):
     def check(self) -> None:
         """Shapes that belong together, unit quaternions, noises."""
         P, B = self.s.numel(), len(self.positions)
-        own = {"noise": (B,), "angle_noise": (B,), "offsets": (P, 3), "mounting": (P, 4)}
+        noises = {name: noise_shape(getattr(self, name), B, P) for name in ("noise", "angle_noise")}
+        own = noises | {"offsets": (P, 3), "mounting": (P, 4)}
         if said := shape_error(self, {"s": (P,), "positions": (B, P, 3), "orientations": (B, P, 4)} | own):
             raise ValueError(f"{said} with {P} arc lengths and {B} samples")
         if not P or not B:

@@ -99,9 +99,16 @@ def shape_error(sensor: object, wanted: Mapping[str, tuple[int | None, ...]]) ->
     return None
 
 
-def variance(noise: float | Float[Tensor, " B"], trailing: int = 1) -> float | Tensor:
-    """noise^2, of all rows of a sample, which stand in so many dimensions: a number, or (B, 1, ..)."""
-    return noise.reshape(-1, *[1] * trailing) ** 2 if isinstance(noise, Tensor) else noise**2
+def variance(noise: float | Float[Tensor, " B"] | Float[Tensor, "B P"], trailing: int = 1) -> float | Tensor:
+    """noise^2 of rows that stand in so many dimensions: a number, (B, 1, ..), or (B, P, ..) where each place has its own."""
+    if not isinstance(noise, Tensor):
+        return noise**2
+    return noise.reshape(*noise.shape, *[1] * (trailing + 1 - noise.ndim)) ** 2
+
+
+def noise_shape(noise: float | Tensor, B: int, P: int) -> tuple[int, ...]:
+    """The shape that a noise must have: one number for each sample, or one for each place of each sample."""
+    return (B, P) if isinstance(noise, Tensor) and noise.ndim == 2 else (B,)
 
 
 def rows_of(sensor: object, index: Int[Tensor, " b"], *names: str) -> dict[str, Tensor]:

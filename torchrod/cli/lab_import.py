@@ -1,0 +1,47 @@
+"""torchrod import: a file of a measuring system to shapes."""
+
+import warnings
+from pathlib import Path
+
+import torch
+from jsonargparse import Namespace
+
+from ..io import read_base_pose, read_robot, write_shapes
+from ..io.lab_formats import Imported, convert, read_layout, read_recording
+from ..util.errors import InputError
+from .arguments import writable
+
+
+def lab_import(options: Namespace) -> None:
+    """torchrod import."""
+    writable(options.out, (".csv", ".npz"))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*nothing hangs")  # of no import's concern
+        robot = read_robot(options.robot)
+    layout = read_layout(options.layout)
+    recording = read_recording(options.format, options.file, layout)
+    try:
+        found = convert(Path(options.file), recording, layout, robot, read_base_pose(options.robot))
+    except InputError:  # names its own file
+        raise
+    except ValueError as error:
+        raise InputError(f"{options.file}: {error}") from None
+    if not len(found.shapes.samples):
+        raise InputError(f"{options.file}: holds no frames; export it again")
+    write_shapes(options.out, found.shapes)
+    print(_report(options.out, found))  # noqa: T201
+
+
+def _report(out: str, found: Imported) -> str:
+    shapes = found.shapes
+    read = torch.isfinite(shapes.positions).all(-1)
+    for values in shapes.readings.values():
+        read = read | torch.isfinite(values).all(-1)
+    gone = f", {int((~read).sum())} of {read.numel()} readings missing" if bool((~read).any()) else ""
+    lines = [f"{out}: {len(shapes.samples)} samples of {len(shapes.s)} places along the rod{gone}"]
+    if found.rms is not None:
+        lines.append(f"markers of the base plate: {1e3 * found.rms:.3g} mm from their places")
+    if found.pose is not None:
+        position, rotation = ([round(v, 9) for v in value.tolist()] for value in (found.pose.position, found.pose.rotation))
+        lines.append(f"the base in the file's world, for ROBOT.toml: [base] position = {position}, rotation = {rotation}")
+    return "\n".join(lines)
