@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..estimation.intervals import Intervals, sampled_intervals
 from ..estimation.load_profile import Profile, joined_profile
 from ..estimation.result import Estimate
 from ..estimation.shared import STEPS, BaseFrame, with_shared_frame
@@ -63,7 +64,7 @@ class Analysis:
     problem: as it was fitted in the end, with the noise and in the base frame that were found. estimate: loads and how sure. parts:
     the unknowns that were chosen, each with the samples that chose it. evidence: what spoke for each hypothesis; None where there
     was one. noise: where it was estimated, else None. frame: the base frame's error that all samples share, else None. diagnosis:
-    what is wrong with samples that no fit explains.
+    what is wrong with samples that no fit explains. intervals: from draws of the posterior, where that was asked for.
     """
 
     problem: Problem
@@ -73,11 +74,16 @@ class Analysis:
     noise: Noise | None
     frame: BaseFrame | None
     diagnosis: Diagnosis
+    intervals: Intervals | None = None
 
     @cached_property
     def profile(self) -> Profile | None:
-        """f(s) of every sample with its band; None for point loads, which have no density."""
-        return joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
+        """f(s) of every sample with its band, from the draws where there are any; None for point loads, which have no density."""
+        own = joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
+        if own is None or self.intervals is None or self.intervals.band is None:
+            return own
+        drawn = self.intervals.band
+        return replace(own, band=torch.where(drawn.isnan(), own.band, drawn))
 
     def message(self, sample: int) -> str:
         """What became of a sample, what is wrong with it, and what to do."""
@@ -91,13 +97,16 @@ def analyze(
     settings: Settings | None = None,
     start: StartFor = learned_or_cold,
     bar: Bar = no_bar,
+    sampled: bool = False,
 ) -> Analysis:
     """Everything that `torchrod estimate` does, from readings to judged loads.
 
     problem: robot, unknowns and readings. candidates: hypotheses that compete (`contact_hypotheses`); None: the problem's unknowns
     alone. unknown_noise: estimate the markers' noise of each sample from the residual; what the markers state plays no part then. A
     registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
-    progress, called with a total and a name. Errors: ValueError as torchrod.estimate.
+    progress, called with a total and a name. sampled: intervals and bands from draws of the posterior
+    (estimation.draws); not where all samples share a base frame, whose error the draws of one sample cannot have.
+    Errors: ValueError as torchrod.estimate.
     """
     settings, noise = settings or Settings(), None
     competing = list(candidates) if candidates is not None else [Hypothesis("", _count(problem), problem.unknowns)]
@@ -128,7 +137,8 @@ def analyze(
     if len(parts) == 1:
         problem = problem.of(parts[0][0])
     found = found if noise is None else noise.judged(found)
-    return Analysis(problem, found, parts, evidence, noise, frame, diagnose(problem, found, settings, parts))
+    drawn = sampled_intervals(problem, found, parts, nu=settings.robust) if sampled and frame is None else None
+    return Analysis(problem, found, parts, evidence, noise, frame, diagnose(problem, found, settings, parts), drawn)
 
 
 def _count(problem: Problem) -> int:

@@ -15,6 +15,8 @@ from torch import Tensor
 from ..analysis.count import Evidence
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
+from ..estimation.draws import Method
+from ..estimation.intervals import Intervals
 from ..estimation.load_profile import Profile
 from ..estimation.result import Estimate, FittedRod
 from ..util.errors import InputError, shown
@@ -35,8 +37,21 @@ COLUMNS = (
 Columns = dict[str, list[Any]]
 
 
-def _columns(estimate: Estimate) -> Columns:
+def _merged(estimate: Estimate, drawn: Intervals | None, name: str) -> Tensor:
+    """magnitude_interval or location_interval: of the draws where there are any, else of the normal distribution."""
+    own = getattr(estimate, f"{name}_interval")
+    if drawn is None:
+        return own
+    found = getattr(drawn, name)
+    return torch.where(found.isnan(), own, found)
+
+
+def _columns(estimate: Estimate, drawn: Intervals | None) -> Columns:
     found = {name: getattr(estimate, name) for name in COLUMNS}
+    if drawn is not None:
+        found |= {f"{name}_interval": _merged(estimate, drawn, name) for name in ("magnitude", "location")}
+        found |= {"drawn_force": drawn.force, "resultant": drawn.resultant, "k_hat": drawn.k_hat, "ess": drawn.ess}
+        found |= {"method": drawn.method, "tip_interval": drawn.tip}
     if estimate.tip_covariance is not None:
         found["tip_std"] = estimate.tip_covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     if bool(estimate.outlier.any()):
@@ -62,7 +77,8 @@ def _loads(of: Columns, b: int) -> list[dict[str, object]]:
             "net_force_local_N": of["net_force"][b][k],
             "covariance": of["magnitude_location_covariance"][b][k],
             "std": {"magnitude_N": of["magnitude_std"][b][k], "location_m": of["location_std"][b][k]},
-            "interval_95": {"magnitude_N": of["magnitude_interval"][b][k], "location_m": of["location_interval"][b][k]},
+            "interval_95": {"magnitude_N": of["magnitude_interval"][b][k], "location_m": of["location_interval"][b][k]}
+            | ({"force_local_N": of["drawn_force"][b][k]} if "drawn_force" in of else {}),
         }
         for k, force in enumerate(of["force"][b])
         if not math.isnan(force[0])
@@ -94,7 +110,14 @@ def _record(of: Columns, b: int, sample: str, message: str) -> dict[str, str]:
     if "tip_std" in of:
         tip, std = of["tip"][b], of["tip_std"][b]
         spread = {"force_N": std[:3], "moment_Nm": std[3:]}
-        record["tip"] = _numbers({"force_N": tip[:3], "moment_Nm": tip[3:], "std": spread})
+        content = {"force_N": tip[:3], "moment_Nm": tip[3:], "std": spread}
+        if "tip_interval" in of:
+            content["interval_95"] = {"force_N": of["tip_interval"][b][:3], "moment_Nm": of["tip_interval"][b][3:]}
+        record["tip"] = _numbers(content)
+    if "method" in of:
+        whole = of["resultant"][b]
+        record["resultant"] = _numbers({"interval_95": {"force_base_N": whole[:3], "magnitude_N": whole[3]}})
+        record["draws"] = _numbers({"method": Method(of["method"][b]).label, "k_hat": of["k_hat"][b], "ess": of["ess"][b]})
     if "registration" in of:
         twist = of["registration"][b]
         record["registration"] = _numbers({"translation_m": twist[:3], "rotation_rad": twist[3:]})
@@ -140,9 +163,10 @@ def _texts(
     profile: Profile | None,
     diagnosis: Diagnosis | None,
     noise: Noise | None,
+    drawn: Intervals | None,
 ) -> Iterator[str]:
     """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
-    of = _columns(estimate)
+    of = _columns(estimate, drawn)
     for b, name in enumerate(samples):
         record = _record(of, b, name, _message(estimate, diagnosis, b))
         if evidence is not None:
@@ -172,11 +196,13 @@ def write_result(
     profile: Profile | None = None,
     diagnosis: Diagnosis | None = None,
     noise: Noise | None = None,
+    drawn: Intervals | None = None,
 ) -> None:
     """RESULT.json, or RESULT.npz with the fields of torchrod.Estimate as arrays.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
+    drawn: intervals from draws of the posterior (estimation.intervals), which then stand in place of the normal ones.
     Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
     """
     path = Path(path)
@@ -185,7 +211,7 @@ def write_result(
     if len(samples) != len(estimate.status):
         raise InputError(f"{path}: {len(samples)} names for {len(estimate.status)} samples; give every sample its name")
     if path.suffix == ".json":
-        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise)
+        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, drawn)
         put(path, lambda file: _stream(file, json.dumps(robot), texts))
         return
     said, which = np.unique([_message(estimate, diagnosis, b) for b in range(len(samples))], return_inverse=True)
@@ -194,8 +220,12 @@ def write_result(
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
         names["hypotheses"] = np.array(evidence.names)
-    for name in ("magnitude_location_covariance", "location_interval", "warm_started"):
+    for name in ("magnitude_location_covariance", "warm_started"):
         arrays[name] = getattr(estimate, name)
+    arrays |= {f"{name}_interval": _merged(estimate, drawn, name) for name in ("magnitude", "location")}
+    if drawn is not None:
+        arrays |= {"force_interval": drawn.force, "resultant_interval": drawn.resultant, "tip_interval": drawn.tip}
+        arrays |= {"k_hat": drawn.k_hat, "ess": drawn.ess, "draws_method": drawn.method}
     if noise is not None:
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
