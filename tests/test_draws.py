@@ -94,3 +94,21 @@ def test_draws_are_in_equilibrium_and_of_their_sample_alone(tendons: bool):
     index = torch.tensor([1])
     alone = tr.posterior_draws(problem.take(index), fit.of(index, problem.size), 128)
     assert torch.allclose(alone.x[0], draws.x[1], rtol=1e-6, atol=1e-8)
+
+
+def test_evidence_and_intervals_where_the_number_of_pushes_is_chosen():
+    """No push, one and two, each by all three numbers: the true one has the most evidence, and all have intervals."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    F = T([[[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], [[0.7, 0.2, 0.0], [0.0, 0.0, 0.0]], [[0.9, 0.1, 0.0], [0.2, -0.8, 0.0]]])
+    p = tr.solve_shape(robot, (tr.PointForces(F, T([[0.15, 0.32]]).expand(3, -1)),), None, s, 3, 80).p
+    problem = posed(s, p + 4e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(5)), 4e-4)
+    evidence = []
+    for count in range(3):
+        own = problem.of(unknowns_of(robot, count))
+        evidence.append(tr.posterior_draws(own, tr.estimate(own), 128).log_evidence.nan_to_num(-1e9))
+    assert torch.stack(evidence).argmax(0).tolist() == [0, 1, 2]
+    found = tr.analyze(problem, tr.contact_hypotheses(problem), sampled=True)
+    assert found.intervals is not None
+    assert torch.isfinite(found.intervals.magnitude[..., 0]).sum(-1).tolist() == [0, 1, 2]
+    assert bool(torch.isfinite(found.intervals.resultant).all())
+    assert float(found.intervals.resultant[0].abs().max()) < 1e-2

@@ -22,6 +22,8 @@ from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
 
+MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
+
 
 def learned_or_cold(problem: Problem) -> StartRule:
     """The shipped checkpoint that fits a problem, else a cold start."""
@@ -38,7 +40,8 @@ def contact_hypotheses(
 
     contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
     against distributed. locations: known ones (m), one for each contact. With contacts "auto" an unknown tip of the problem's
-    unknowns competes with nothing at the tip; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
+    unknowns competes with nothing at the tip, and where none is unknown a force there is tried on samples that take two contacts
+    or that nothing explains; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
     prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
@@ -54,6 +57,10 @@ def contact_hypotheses(
                 name += f" + tip {tip}" if len(tips) > 1 and tip != "none" else ""
                 loads = GaussianCoordinates(k, rod.length, rod.force_scale, prior, at)
                 found.append(Hypothesis(name, k, replace(known, loads=loads, tip=tip)))
+    if contacts == "auto" and known.tip == "none":
+        for k in range(MOST_BESIDE_TIP + 1):
+            loads = GaussianCoordinates(k, rod.length, rod.force_scale, priors[0], at)
+            found.append(Hypothesis(f"{k} + tip force", k, replace(known, loads=loads, tip="force"), spare=True))
     return found
 
 

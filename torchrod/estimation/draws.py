@@ -76,7 +76,7 @@ class Draws:
 
     x (B, D, n), weight (B, D), which sum to 1. k_hat (B,): Pareto's shape of the weights; above 0.7 they are not to be trusted.
     ess (B,): to how many independent draws they amount. log_evidence (B,): log of the mean unnormalized weight, the marginal
-    likelihood of the unknowns up to what all of a sample's hypotheses share; NaN where the draws were tempered past it. method
+    likelihood of the unknowns up to what all of a sample's hypotheses share: the larger, the better they explain it. method
     (B,): Method codes. NaN throughout where the fit has not converged.
     """
 
@@ -507,6 +507,10 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
     k_hat, ess, evidence = (torch.full((B,), torch.nan, dtype=DTYPE) for _ in range(3))
     method = torch.zeros(B, dtype=torch.int64)
     fine = (estimate.status == int(Status.CONVERGED)) & torch.isfinite(estimate.covariance).flatten(1).all(-1)
+    if not problem.state.base.at.start:  # nothing is unknown but what equilibrium gives
+        known = fine.to(DTYPE).masked_fill(~fine, torch.nan)
+        x, weight = estimate.x.unsqueeze(1).expand(B, draws, n), (known / draws).unsqueeze(-1).expand(B, draws)
+        return Draws(problem, x, weight, 0 * known, draws * known, -0.5 * estimate.cost * known, fine * int(Method.IMPORTANCE))
     with torch.inference_mode(False), one_thread():
         for rows in fine.nonzero().squeeze(-1).split(max(1, ROWS // draws)):
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
@@ -514,6 +518,7 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
             target = _Target(part, estimate.x[rows], C, nu)
             found = _importance(target, _about(target, C, draws), draws)
             x[rows], weight[rows] = found.x, found.log_weight.exp()
-            k_hat[rows], ess[rows], evidence[rows] = found.k_hat, found.ess, found.log_evidence
+            alike = math.lgamma(len(target.chart.places) + 1)  # as many orders of the loads, of which the draws have one
+            k_hat[rows], ess[rows], evidence[rows] = found.k_hat, found.ess, found.log_evidence + alike
             method[rows] = found.method
     return Draws(problem, x, weight, k_hat, ess, evidence, method)

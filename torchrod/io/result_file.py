@@ -147,7 +147,8 @@ def _profile(profile: Profile, b: int) -> str:
 
 
 def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
-    rows = list(zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True))
+    every = zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True)
+    rows = [row for row in every if row[0] not in evidence.spare or not math.isnan(row[1])]
     return {
         "chosen": evidence.names[int(evidence.choice[b])],
         "bic": {name: plain(value) for name, value, _ in rows},
