@@ -73,7 +73,8 @@ def test_the_count_is_found_and_its_evidence_told(contacts, tmp_path):
         known = {name: bic for name, bic in sample["evidence"]["bic"].items() if bic is not None}
         assert min(known, key=lambda name: known[name]) == str(contacts)
         foreseen = sample["evidence"]["bic_foreseen"]
-        assert sorted([*known, *foreseen, *sample["evidence"]["not_converged"]]) == ["0", "1", "2", "3"]
+        told = {*known, *foreseen, *sample["evidence"]["not_converged"]}
+        assert sorted(told - {"0 + tip force", "1 + tip force"}) == ["0", "1", "2", "3"]
         assert foreseen.get(str(contacts + 1), math.inf) > known[str(contacts)], "why one more was not needed"
         for load, (x, y, s) in zip(sorted(sample["loads"], key=lambda v: v["location_m"]), FORCES[contacts], strict=True):
             assert abs(load["location_m"] - s) < 0.03

@@ -26,7 +26,11 @@ from .data.dataset import simulate_shard as simulate_shard
 from .data.shards import Dataset as Dataset
 from .data.shards import read_dataset as read_dataset
 from .data.spec_file import read_dataset_spec as read_dataset_spec
+from .estimation.draws import Draws as Draws
+from .estimation.draws import posterior_draws as posterior_draws
 from .estimation.estimate import estimate as estimate
+from .estimation.intervals import Intervals as Intervals
+from .estimation.intervals import sampled_intervals as sampled_intervals
 from .estimation.load_profile import Profile as Profile
 from .estimation.load_profile import load_profile as load_profile
 from .estimation.result import Estimate as Estimate

@@ -57,22 +57,28 @@ class Evidence:
     """What speaks for each hypothesis: names (H); bic (B, H), chi^2 + k ln(n), of which the least is chosen; choice (B,), an index.
 
     NaN where a hypothesis was not needed, inf where its fit did not converge. foreseen (B, H): the BIC that the score test of the
-    fit with one load less promises, to first order, by which a hypothesis was needed or not; NaN where there is no such fit.
+    fit with one load less promises, to first order, by which a hypothesis was needed or not; NaN where there is no such fit. spare:
+    the names of those that are tried only where the others do not serve.
     """
 
     names: tuple[str, ...]
     choice: Int[Tensor, " B"]
     bic: Float[Tensor, "B H"]
     foreseen: Float[Tensor, "B H"]
+    spare: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One explanation of the readings: `contacts` loads among its unknowns; name is what files call it."""
+    """One explanation of the readings: `contacts` loads among its unknowns; name is what files call it.
+
+    spare: tried only where the others take at least two contacts more than it has, or explain nothing.
+    """
 
     name: str
     contacts: int
     unknowns: Unknowns
+    spare: bool = False
 
 
 def free_parameters(problem: Problem) -> int:
@@ -133,7 +139,10 @@ def select(
     for h, (hypothesis, own) in enumerate(zip(candidates, problems, strict=True)):
         if chosen is not None and not own.determined:
             continue
-        index, begin = _needed(h, candidates, problems, fits, start(own), foreseen[:, h])
+        if hypothesis.spare and chosen is not None:
+            index, begin = _wanting(hypothesis, candidates, chosen), start(own)
+        else:
+            index, begin = _needed(h, candidates, problems, fits, start(own), foreseen[:, h])
         if not len(index):
             continue
         part = own.take(index)
@@ -144,13 +153,23 @@ def select(
         if chosen is None:
             chosen = _Selection(other, torch.full((B,), h), scores, foreseen)
             continue
+        if hypothesis.spare and not bool((other.accepted & (scores[index, h] < scores[index, chosen.choice[index]])).any()):
+            continue  # nothing of it in the result, then
         best = scores[index, chosen.choice[index]]
         chosen.swap(h, index, other, _explains_better(scores[index, h], best, other, chosen.fit, index), scores[index, h])
     assert chosen is not None
     _simplify(chosen, candidates, problems, hasty)
     if settings.restarts:
         _try_again(chosen, problems, settings, start)
-    return chosen.fit, Evidence(tuple(h.name for h in candidates), chosen.choice, chosen.scores, chosen.foreseen)
+    spare = frozenset(h.name for h in candidates if h.spare)
+    return chosen.fit, Evidence(tuple(h.name for h in candidates), chosen.choice, chosen.scores, chosen.foreseen, spare)
+
+
+def _wanting(spare: Hypothesis, candidates: Sequence[Hypothesis], chosen: _Selection) -> Int[Tensor, " b"]:
+    """The samples that a spare hypothesis is tried on."""
+    contacts = torch.tensor([c.contacts for c in candidates])[chosen.choice]
+    more = contacts >= spare.contacts + 2
+    return ((more | ~chosen.fit.accepted) & torch.isfinite(chosen.fit.chi2)).nonzero().squeeze(-1)
 
 
 def parts_of(candidates: Sequence[Hypothesis], evidence: Evidence) -> Parts:
@@ -187,7 +206,7 @@ def _ways_back(candidates: Sequence[Hypothesis]) -> list[tuple[int, int, int]]:
 
     Numbers of contacts alone are not worth it: there a fit with too few loads that explains nothing is nearly always what it seems.
     """
-    if len({h.unknowns.tip for h in candidates}) < 2:
+    if len({h.unknowns.tip for h in candidates if not h.spare}) < 2:
         return []
     found = []
     for more, a in reversed(list(enumerate(candidates))):

@@ -36,6 +36,9 @@ MOST_EXCHANGES = 3
 LOWERED = 0.5  # an exchange must halve what it is tried for, and chi^2, to be told
 TRANSLATION, ROTATION = 0.1, 0.35  # of the length, and rad: a base frame that is farther off than that is another mistake
 SURE = 10.0  # BIC: by so much a base frame must do better before it speaks against a fit that is accepted
+OPPOSITE = 0.3  # two forces are a couple where together they are no more than this part of the larger,
+APART = 0.25  # no farther apart than this part of the length,
+VAGUE = 0.8  # and each no better known than to this part of itself
 ITERATIONS = 60
 ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
@@ -50,8 +53,9 @@ class Diagnosis:
     s: (P,) m, of the markers. exchanged: per sample the groups of markers (counted from 0) whose labels look exchanged, mostly
     pairs. registration: (B, 6) [m, rad], an error of the base frame that explains the markers; NaN where none does. one_more: (B,),
     where one more load does. geometry: per sample what is wrong with its markers' unit, frame or order, or nothing. outliers: per
-    sample the markers without which a robust fit explains the others. others: per sample what else explains its readings; () where
-    nothing was looked for.
+    sample the markers without which a robust fit explains the others. couple (B,): where (m) loads, or those of one load more, are
+    a large opposite couple, which no contact is; NaN where there is none. tip_instead (B,): where a force at the tip explains the
+    shape with fewer contacts than without it. others: per sample what else explains its readings; () where nothing was looked for.
     """
 
     s: Float[Tensor, " P"]
@@ -60,6 +64,8 @@ class Diagnosis:
     one_more: Bool[Tensor, " B"]
     geometry: tuple[str, ...]
     outliers: tuple[Cycle, ...]
+    couple: Float[Tensor, " B"]
+    tip_instead: Bool[Tensor, " B"]
     others: tuple[tuple[Solution, ...], ...] = ()
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
@@ -94,6 +100,13 @@ class Diagnosis:
                 f"The residual near the base looks like a registration error of about {shift:.2g} mm and {turn:.2g} degrees; "
                 "try --registration."
             )
+        if bool(torch.isfinite(self.couple[sample])):
+            said.append(
+                f"The shape asks for something that is not a contact near s = {1e3 * float(self.couple[sample]):.3g} mm: two large "
+                "opposite forces side by side; check the section, the stiffness and the reference shape there."
+            )
+        if bool(self.tip_instead[sample]):
+            said.append("A force at the tip explains the shape with fewer contacts than lateral pushes alone would take.")
         if bool(self.one_more[sample]):
             said.append("One more contact explains the readings; try more --contacts.")
         if self.geometry[sample]:
@@ -210,14 +223,34 @@ def _with_loads(unknowns: Unknowns, count: int) -> Unknowns | None:
     return replace(unknowns, loads=replace(loads, count=count))
 
 
-def _explained(problem: Problem, own: Float[Tensor, " b"], settings: Settings) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"]]:
+def couples(fit: Estimate, length: float) -> Float[Tensor, " B"]:
+    """Where (m) two loads of a fit are opposite, close together and each hardly known, as unmodelled bending looks; else NaN."""
+    found = fit.chi2.new_full((len(fit.status),), torch.nan)
+    K = fit.location.shape[1]
+    for i in range(K):
+        for j in range(i + 1, K):
+            pair = fit.force[:, [i, j]]
+            larger = pair.norm(dim=-1).amax(-1)
+            opposite = pair.sum(1).norm(dim=-1) < OPPOSITE * larger
+            near = (fit.location[:, i] - fit.location[:, j]).abs() < APART * length
+            vague = (fit.magnitude_std[:, [i, j]] > VAGUE * fit.magnitude[:, [i, j]]).all(-1)
+            middle = 0.5 * (fit.location[:, i] + fit.location[:, j])
+            found = torch.where(opposite & near & vague, middle, found)
+    return found
+
+
+def _explained(
+    problem: Problem, own: Float[Tensor, " b"], settings: Settings
+) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"], Float[Tensor, " b"]]:
     """An error of the base frame, or that one more load, explains the markers: of the two and the fit (its score: own) the best.
+    Last, where (m) one more load only makes a couple: that explains nothing.
 
     A fit that is accepted, for which own is finite, may still have loads that a base frame with fewer would do without.
     """
     unknowns, everyone, refused = problem.unknowns, torch.arange(len(own)), torch.isinf(own).nonzero().squeeze(-1)
     zeta = torch.full((len(own), 6), torch.nan, dtype=torch.float64)
     by_frame, by_load = torch.full_like(own, torch.inf), torch.full_like(own, torch.inf)
+    couple = torch.full_like(own, torch.nan)
     count = getattr(unknowns.loads, "count", 0)
     tried = [(unknowns, refused)] + [(_with_loads(unknowns, k), everyone) for k in {1, count - 1} - {count}]
     for some, index in tried if unknowns.registration is None and problem.sees_frame else ():
@@ -236,10 +269,12 @@ def _explained(problem: Problem, own: Float[Tensor, " b"], settings: Settings) -
     more = _with_loads(unknowns, count + 1)
     if more is not None and len(refused) and (part := problem.of(more).take(refused)).determined:
         fit = estimate_each(part, settings)
-        by_load[refused] = _score(part, fit.accepted, fit.chi2)
+        couple[refused] = torch.where(fit.accepted, couples(fit, problem.robot.rod.length), torch.nan)
+        by_load[refused] = _score(part, fit.accepted & couple[refused].isnan(), fit.chi2)
     best = torch.minimum(by_frame, torch.minimum(by_load, own - SURE))
     framed = torch.isfinite(best) & (by_frame == best)
-    return torch.where(framed.unsqueeze(-1), zeta, torch.nan), torch.isfinite(best) & ~framed & (by_load == best)
+    one_more = torch.isfinite(best) & ~framed & (by_load == best)
+    return torch.where(framed.unsqueeze(-1), zeta, torch.nan), one_more, couple
 
 
 def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
@@ -272,6 +307,8 @@ def diagnose(
     geometry = [""] * B
     outliers: list[Cycle] = [()] * B
     markers, L = problem.markers, problem.robot.rod.length
+    couple = torch.where(fit.status == int(Status.CONVERGED), couples(fit, L), torch.nan)
+    tip_instead = torch.zeros(B, dtype=torch.bool)
 
     def misplaced_at(b: int) -> str:
         if markers is not None:
@@ -280,9 +317,11 @@ def diagnose(
 
     for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():
         geometry[b] = misplaced_at(b)
-    richest = [own for own in (problem.of(unknowns) for unknowns, _ in parts) if own.determined][-1]
+    determined = [own for own in (problem.of(unknowns) for unknowns, _ in parts) if own.determined]
+    richest = max(reversed(determined), key=lambda own: own.state.loads.size)
     for unknowns, index in parts:
         own = problem.of(unknowns)
+        tip_instead[index] = len(parts) > 1 and unknowns.tip != "none" and problem.unknowns.tip == "none"
         chosen = len(parts) > 1 and own.state.external.stop > 4
         doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & own.take(index).usable
         for rows in index[doubtful].split(CHUNK):
@@ -294,8 +333,9 @@ def diagnose(
                 geometry[b] = misplaced_at(b)
             rest = rows[[not (exchanged[b] or geometry[b]) for b in rows.tolist()]]
             part = own.take(rest)
-            registration[rest], one_more[rest] = _explained(part, _score(part, fit.accepted[rest], fit.chi2[rest]), hasty)
+            registration[rest], one_more[rest], pair = _explained(part, _score(part, fit.accepted[rest], fit.chi2[rest]), hasty)
+            couple[rest] = torch.where(couple[rest].isnan(), pair, couple[rest])
             rest = rest[~fit.accepted[rest] & ~one_more[rest] & registration[rest].isnan().any(-1)]
             for b, off in zip(rest.tolist(), _outliers(richest.take(rest), settings or Settings()), strict=True):
                 outliers[b] = off
-    return Diagnosis(problem.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers))
+    return Diagnosis(problem.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers), couple, tip_instead)

@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..estimation.intervals import Intervals
 from ..estimation.result import Estimate
 from ..model.problem import Problem
 from ..model.sensors import Markers
+from .alternatives import Solution
 from .count import Evidence
 from .diagnosis import Diagnosis
 from .noise import Noise
@@ -110,18 +112,30 @@ def joined_noise(parts: Sequence[Noise | None], found: Sequence[Pattern], count:
     return Noise(sigma, std, freedom)
 
 
+def joined_intervals(parts: Sequence[Intervals | None], found: Sequence[Pattern], count: int) -> Intervals | None:
+    """The intervals of every sample."""
+    known = [p for p in parts if p is not None]
+    if len(known) < len(parts):
+        return None
+    return Intervals(**{f.name: _whole([getattr(p, f.name) for p in known], found, count) for f in fields(Intervals)})  # pyright: ignore[reportArgumentType]
+
+
 def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], problem: Problem) -> Diagnosis:
     """What is said of every sample, its markers counted among all of the batch."""
     B = problem.batch
     registration = _whole([p.registration for p in parts], found, B)
-    more = _whole([p.one_more for p in parts], found, B)
-    assert registration is not None and more is not None
+    more, couple, instead = (_whole([getattr(p, f) for p in parts], found, B) for f in ("one_more", "couple", "tip_instead"))
+    assert registration is not None and more is not None and couple is not None and instead is not None
     exchanged: list[tuple[tuple[int, ...], ...]] = [()] * B
     geometry, outliers = [""] * B, [()] * B
+    others: list[tuple[Solution, ...]] = [()] * B
     for part, pattern in zip(parts, found, strict=True):
         at = pattern.places.tolist()
         for k, b in enumerate(pattern.samples.tolist()):
             exchanged[b] = tuple(tuple(at[i] for i in cycle) for cycle in part.exchanged[k])
             outliers[b] = tuple(at[i] for i in part.outliers[k])
             geometry[b] = part.geometry[k]
-    return Diagnosis(problem.s, tuple(exchanged), registration, more, tuple(geometry), tuple(outliers))
+            others[b] = part.others[k] if part.others else ()
+    return Diagnosis(
+        problem.s, tuple(exchanged), registration, more, tuple(geometry), tuple(outliers), couple, instead, tuple(others)
+    )

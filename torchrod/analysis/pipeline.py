@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..estimation.intervals import Intervals, sampled_intervals
 from ..estimation.load_places import LoadPlaces, load_places
 from ..estimation.load_profile import Profile, joined_profile
 from ..estimation.result import Estimate
@@ -22,7 +23,9 @@ from .alternatives import other_solutions
 from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, select
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
-from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_noise, part_of, patterns
+from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_intervals, joined_noise, part_of, patterns
+
+MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
 
 
 def learned_or_cold(problem: Problem) -> StartRule:
@@ -40,7 +43,8 @@ def contact_hypotheses(
 
     contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
     against distributed. locations: known ones (m), one for each contact. With contacts "auto" an unknown tip of the problem's
-    unknowns competes with nothing at the tip; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
+    unknowns competes with nothing at the tip, and where none is unknown a force there is tried on samples that take two contacts
+    or that nothing explains; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
     prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
@@ -56,6 +60,10 @@ def contact_hypotheses(
                 name += f" + tip {tip}" if len(tips) > 1 and tip != "none" else ""
                 loads = GaussianCoordinates(k, rod.length, rod.force_scale, prior, at)
                 found.append(Hypothesis(name, k, replace(known, loads=loads, tip=tip)))
+    if contacts == "auto" and known.tip == "none":
+        for k in range(MOST_BESIDE_TIP + 1):
+            loads = GaussianCoordinates(k, rod.length, rod.force_scale, priors[0], at)
+            found.append(Hypothesis(f"{k} + tip force", k, replace(known, loads=loads, tip="force"), spare=True))
     return found
 
 
@@ -66,7 +74,7 @@ class Analysis:
     problem: as it was fitted in the end, with the noise and in the base frame that were found. estimate: loads and how sure. parts:
     the unknowns that were chosen, each with the samples that chose it. evidence: what spoke for each hypothesis; None where there
     was one. noise: where it was estimated, else None. frame: the base frame's error that all samples share, else None. diagnosis:
-    what is wrong with samples that no fit explains.
+    what is wrong with samples that no fit explains. intervals: from draws of the posterior, where that was asked for.
     """
 
     problem: Problem
@@ -76,11 +84,16 @@ class Analysis:
     noise: Noise | None
     frame: BaseFrame | None
     diagnosis: Diagnosis
+    intervals: Intervals | None = None
 
     @cached_property
     def profile(self) -> Profile | None:
-        """f(s) of every sample with its band; None for point loads, which have no density."""
-        return joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
+        """f(s) of every sample with its band, from the draws where there are any; None for point loads, which have no density."""
+        own = joined_profile(self.problem, self.parts, self.estimate.x, self.estimate.covariance)
+        if own is None or self.intervals is None or self.intervals.band is None:
+            return own
+        drawn = self.intervals.band
+        return replace(own, band=torch.where(drawn.isnan(), own.band, drawn))
 
     @cached_property
     def places(self) -> LoadPlaces:
@@ -99,13 +112,16 @@ def analyze(
     settings: Settings | None = None,
     start: StartFor = learned_or_cold,
     bar: Bar = no_bar,
+    sampled: bool = False,
 ) -> Analysis:
     """Everything that `torchrod estimate` does, from readings to judged loads.
 
     problem: robot, unknowns and readings. candidates: hypotheses that compete (`contact_hypotheses`); None: the problem's unknowns
     alone. unknown_noise: estimate the markers' noise of each sample from the residual; what the markers state plays no part then. A
     registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
-    progress, called with a total and a name. Errors: ValueError as torchrod.estimate.
+    progress, called with a total and a name. sampled: intervals and bands from draws of the posterior
+    (estimation.draws); not where all samples share a base frame, whose error the draws of one sample cannot have.
+    Errors: ValueError as torchrod.estimate.
     """
     registration = problem.unknowns.registration
     split = patterns(problem) if registration is None or registration.scope is not Scope.SHARED else []
@@ -113,7 +129,7 @@ def analyze(
         with bar(problem.batch, "samples") as shown:
             found = []
             for pattern in split:
-                found.append(analyze(part_of(problem, pattern), candidates, unknown_noise, settings, start))
+                found.append(analyze(part_of(problem, pattern), candidates, unknown_noise, settings, start, sampled=sampled))
                 shown.update(len(pattern.samples))
         return _joined(problem, found, split)
     settings, noise = settings or Settings(), None
@@ -146,7 +162,8 @@ def analyze(
         problem = problem.of(parts[0][0])
     found = found if noise is None else noise.judged(found)
     diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
-    return Analysis(problem, found, parts, evidence, noise, frame, diagnosis)
+    drawn = sampled_intervals(problem, found, parts, nu=settings.robust) if sampled and frame is None else None
+    return Analysis(problem, found, parts, evidence, noise, frame, diagnosis, drawn)
 
 
 def _joined(problem: Problem, found: Sequence[Analysis], split: Sequence[Pattern]) -> Analysis:
@@ -160,7 +177,8 @@ def _joined(problem: Problem, found: Sequence[Analysis], split: Sequence[Pattern
     estimate = joined_estimate([a.estimate for a in found], split, problem)
     evidence = joined_evidence([a.evidence for a in found], split, B)
     diagnosis = joined_diagnosis([a.diagnosis for a in found], split, problem)
-    return Analysis(problem, estimate, parts, evidence, noise, None, diagnosis)
+    drawn = joined_intervals([a.intervals for a in found], split, B)
+    return Analysis(problem, estimate, parts, evidence, noise, None, diagnosis, drawn)
 
 
 def _count(problem: Problem) -> int:

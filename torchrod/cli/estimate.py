@@ -96,8 +96,9 @@ def estimate(options: Namespace) -> None:
     problem = _problem(options, robot, shapes, noise)
     candidates = contact_hypotheses(problem, _count(options, robot), options.load_prior, options.location or None)
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
+    sampled = options.intervals == "sampled" and bool(options.out or options.plot)  # which the table does not show
     try:
-        found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar)
+        found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar, sampled)
     except InputError:  # names its own file
         raise
     except ValueError as error:
@@ -105,8 +106,9 @@ def estimate(options: Namespace) -> None:
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
     if options.out:
-        said = (found.evidence, _profile(options, found), found.diagnosis, found.noise, found.places)
-        write_result(options.out, fit, shapes.samples, robot.name, *said, read_base_pose(options.robot), shapes.time)
+        said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
+        said |= {"profile": _profile(options, found), "base": read_base_pose(options.robot), "time": shapes.time}
+        write_result(options.out, fit, shapes.samples, robot.name, **said)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
 

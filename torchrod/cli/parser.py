@@ -85,6 +85,13 @@ def _estimate_parser() -> ArgumentParser:
         "--unknown-tip", type=str, choices=["none", "force", "wrench"], default="none", help="also estimate what acts on the tip"
     )
     _number_list(parser, "--location", "known locations of the loads (m), one per load")
+    parser.add_argument(
+        "--intervals",
+        type=str,
+        choices=["sampled", "gaussian"],
+        default="gaussian",
+        help="95 %% intervals in RESULT: from the covariance, or from draws of the posterior, about 10 ms of CPU a shape",
+    )
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
     about = "whether RESULT has the load profiles and their bands; auto: up to 1,000 samples"
     parser.add_argument("--profile", type=str, choices=["auto", "on", "off"], default="auto", help=about)

@@ -68,10 +68,15 @@ def _density(family: LoadFamily, gamma: Float[Tensor, "... n"], s: Float[Tensor,
 def _band(
     family: LoadFamily, gamma: Float[Tensor, "b g"], C: Float[Tensor, "b g g"], s: Float[Tensor, " S"]
 ) -> Float[Tensor, "b S 3 2"]:
-    """Pointwise quantiles of f_x, f_y, |f| over the draws; linear between the order statistics."""
+    """Of draws of the normal posterior, along the curves on which it is most nearly one."""
     step = torch.einsum("bij,dj->bdi", _root(C), _normal(gamma.shape[-1]))
     std = C.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(1)
-    f = _density(family, family.moved(gamma.unsqueeze(1), step, std), s)
+    return _quantiles(family, family.moved(gamma.unsqueeze(1), step, std), s)
+
+
+def _quantiles(family: LoadFamily, gamma: Float[Tensor, "b D g"], s: Float[Tensor, " S"]) -> Float[Tensor, "b S 3 2"]:
+    """Pointwise quantiles of f_x, f_y, |f| over DRAWS draws; linear between the order statistics."""
+    f = _density(family, gamma, s)
     assert f is not None
     values = torch.cat([f, f.norm(dim=-1, keepdim=True)], -1).movedim(1, -1).contiguous().numpy()
     ordered = np.sort(values, -1)
@@ -80,6 +85,15 @@ def _band(
         k, share = divmod(level * (DRAWS - 1), 1)
         ends.append(ordered[..., int(k)] * (1 - share) + ordered[..., int(k) + 1] * share)
     return torch.from_numpy(np.stack(ends, -1))
+
+
+def band_of_draws(family: LoadFamily, gamma: Float[Tensor, "B D g"], s: Float[Tensor, " S"]) -> Float[Tensor, "B S 3 2"] | None:
+    """The band of DRAWS draws of equal weight that are there already; None for point loads."""
+    if family.size == 0:
+        return gamma.new_zeros(len(gamma), len(s), 3, 2)
+    if _density(family, gamma[:1, :1], s) is None:
+        return None
+    return torch.cat([_quantiles(family, some, s) for some in gamma.split(CHUNK)])
 
 
 def load_profile(

@@ -270,6 +270,12 @@ class Estimate:
         changed["restarts"] = self.restarts.index_add(0, index, other.restarts)
         return Estimate(**changed)  # pyright: ignore[reportArgumentType]
 
+    def of(self, index: Int[Tensor, " b"], size: int) -> "Estimate":
+        """The samples of an index, with the first `size` entries of x: what unknowns of theirs have of a batch that has more."""
+        taken = {f.name: None if (v := getattr(self, f.name)) is None else v[index] for f in fields(Estimate)}
+        taken |= {"x": self.x[index, :size], "covariance": self.covariance[index, :size, :size]}
+        return Estimate(**taken)  # pyright: ignore[reportArgumentType]
+
     @staticmethod
     def cat(parts: list["Estimate"]) -> "Estimate":
         """Join the estimates of several chunks."""

@@ -18,6 +18,8 @@ from ..analysis.alternatives import Solution
 from ..analysis.count import Evidence
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
+from ..estimation.draws import Method
+from ..estimation.intervals import Intervals
 from ..estimation.load_places import LoadPlaces
 from ..estimation.load_profile import Profile
 from ..estimation.result import Estimate, FittedRod
@@ -73,8 +75,21 @@ def _in_space(estimate: Estimate, places: LoadPlaces | None, base: BasePose | No
     return found
 
 
-def _columns(estimate: Estimate, space: dict[str, Tensor]) -> Columns:
+def _merged(estimate: Estimate, drawn: Intervals | None, name: str) -> Tensor:
+    """magnitude_interval or location_interval: of the draws where there are any, else of the normal distribution."""
+    own = getattr(estimate, f"{name}_interval")
+    if drawn is None:
+        return own
+    found = getattr(drawn, name)
+    return torch.where(found.isnan(), own, found)
+
+
+def _columns(estimate: Estimate, space: dict[str, Tensor], drawn: Intervals | None) -> Columns:
     found = {name: getattr(estimate, name) for name in COLUMNS} | space
+    if drawn is not None:
+        found |= {f"{name}_interval": _merged(estimate, drawn, name) for name in ("magnitude", "location")}
+        found |= {"drawn_force": drawn.force, "resultant": drawn.resultant, "k_hat": drawn.k_hat, "ess": drawn.ess}
+        found |= {"method": drawn.method, "tip_interval": drawn.tip}
     if estimate.tip_covariance is not None:
         found["tip_std"] = estimate.tip_covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     if bool(estimate.outlier.any()):
@@ -101,7 +116,8 @@ def _loads(of: Columns, b: int) -> list[dict[str, object]]:
             "net_force_local_N": of["net_force"][b][k],
             "covariance": of["magnitude_location_covariance"][b][k],
             "std": {"magnitude_N": of["magnitude_std"][b][k], "location_m": of["location_std"][b][k]},
-            "interval_95": {"magnitude_N": of["magnitude_interval"][b][k], "location_m": of["location_interval"][b][k]},
+            "interval_95": {"magnitude_N": of["magnitude_interval"][b][k], "location_m": of["location_interval"][b][k]}
+            | ({"force_local_N": of["drawn_force"][b][k]} if "drawn_force" in of else {}),
         }
         for k, force in enumerate(of["force"][b])
         if not math.isnan(force[0])
@@ -140,7 +156,14 @@ def _record(of: Columns, b: int, sample: str, message: str) -> dict[str, str]:
         tip, std = of["tip"][b], of["tip_std"][b]
         spread = {"force_N": std[:3], "moment_Nm": std[3:]}
         lab = {"force_lab_N": of["tip_force_lab_N"][b]} if "tip_force_lab_N" in of else {}
-        record["tip"] = _numbers({"force_N": tip[:3], "moment_Nm": tip[3:], **lab, "std": spread})
+        content = {"force_N": tip[:3], "moment_Nm": tip[3:], **lab, "std": spread}
+        if "tip_interval" in of:
+            content["interval_95"] = {"force_N": of["tip_interval"][b][:3], "moment_Nm": of["tip_interval"][b][3:]}
+        record["tip"] = _numbers(content)
+    if "method" in of:
+        whole = of["resultant"][b]
+        record["resultant"] = _numbers({"interval_95": {"force_base_N": whole[:3], "magnitude_N": whole[3]}})
+        record["draws"] = _numbers({"method": Method(of["method"][b]).label, "k_hat": of["k_hat"][b], "ess": of["ess"][b]})
     if "registration" in of:
         twist = of["registration"][b]
         record["registration"] = _numbers({"translation_m": twist[:3], "rotation_rad": twist[3:]})
@@ -170,7 +193,8 @@ def _profile(profile: Profile, b: int) -> str:
 
 
 def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
-    rows = list(zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True))
+    every = zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True)
+    rows = [row for row in every if row[0] not in evidence.spare or not math.isnan(row[1])]
     return {
         "chosen": evidence.names[int(evidence.choice[b])],
         "bic": {name: plain(value) for name, value, _ in rows},
@@ -188,9 +212,10 @@ def _texts(
     noise: Noise | None,
     space: dict[str, Tensor],
     time: list[float] | None,
+    drawn: Intervals | None,
 ) -> Iterator[str]:
     """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
-    of = _columns(estimate, space)
+    of = _columns(estimate, space, drawn)
     for b, name in enumerate(samples):
         record = _record(of, b, name, _message(estimate, diagnosis, b))
         if time is not None:
@@ -210,7 +235,7 @@ def _texts(
 
 def _load_table(estimate: Estimate, samples: list[str], space: dict[str, Tensor], time: Tensor | None) -> str:
     """A row for each load of each sample, the tip's last, and one for a sample without any."""
-    of = _columns(estimate, space)
+    of = _columns(estimate, space, None)
     vectors = {"force_local_N": "force", **{name: name for name in SPACE if name in of}}
     parts = {name: "xyz"[: 2 if name == "force_local_N" else 3] for name in vectors}
     header = ["time_s", "sample", "status", "accepted", "load", *LOAD_NUMBERS]
@@ -255,12 +280,14 @@ def write_result(
     places: LoadPlaces | None = None,
     base: BasePose | None = None,
     time: Float[Tensor, " B"] | None = None,
+    intervals: Intervals | None = None,
 ) -> None:
     """RESULT.json, RESULT.npz with the fields of torchrod.Estimate as arrays, or LOADS.csv with a row for each load.
 
     evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
     places: of the loads in space (torchrod.Analysis.places). base: where the robot stands in the lab. time: of the samples (s).
+    intervals: intervals from draws of the posterior (estimation.intervals), which then stand in place of the normal ones.
     Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
     """
     path = Path(path)
@@ -273,7 +300,8 @@ def write_result(
         put_text(path, _load_table(estimate, samples, space, time))
         return
     if path.suffix == ".json":
-        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, None if time is None else time.tolist())
+        seconds = None if time is None else time.tolist()
+        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, seconds, intervals)
         put(path, lambda file: _stream(file, json.dumps(robot), texts))
         return
     said, which = np.unique([_message(estimate, diagnosis, b) for b in range(len(samples))], return_inverse=True)
@@ -282,8 +310,12 @@ def write_result(
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
         names["hypotheses"] = np.array(evidence.names)
-    for name in ("magnitude_location_covariance", "location_interval", "warm_started"):
+    for name in ("magnitude_location_covariance", "warm_started"):
         arrays[name] = getattr(estimate, name)
+    arrays |= {f"{name}_interval": _merged(estimate, intervals, name) for name in ("magnitude", "location")}
+    if intervals is not None:
+        arrays |= {"force_interval": intervals.force, "resultant_interval": intervals.resultant, "tip_interval": intervals.tip}
+        arrays |= {"k_hat": intervals.k_hat, "ess": intervals.ess, "draws_method": intervals.method}
     if noise is not None:
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:

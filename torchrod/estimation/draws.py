@@ -1,0 +1,524 @@
+"""Draws of the posterior of x, where the ellipse about the fit does not do: importance sampling, and tempering where that fails.
+
+The tip condition (17) holds exactly, so a draw is one of everything but the base wrench (estimation.chart), which equilibrium then
+gives: by one walk from the tip where no weight acts, else by Newton steps on the tip residual. The target is
+
+    (1)  log pi(v) = -cost(x(v)) / 2 + log p(y) + log |det dy/dv|
+
+with the cost of what was read alone, the prior p of estimation.chart, and (2) the weights w = pi / q of draws from q, a Student's t
+about the fit with the fit's covariance, Pareto-smoothed (estimation.pareto). Where k-hat says that q is no proposal for pi, q is
+matched to the weighted mean and covariance of what was drawn so far, and all draws count by the mixture they came from (adaptive
+multiple importance sampling, Cornuet et al. 2012). Where that does not help, draws go from q to pi through q^(1 - b) pi^b with
+Metropolis steps in between, b as large as half of the draws survive (sequential Monte Carlo, Del Moral et al. 2006).
+
+The random numbers are always the same: equal fits have equal draws, whatever their batch.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from functools import cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.special import chdtri
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from ..model.problem import TIP_ROWS, Problem
+from ..util.precision import DTYPE
+from ..util.status import Status
+from ..util.threads import one_thread
+from . import filter as ekf
+from .chart import Chart
+from .evaluator import Evaluator, KernelEvaluator, evaluator
+from .pareto import GOOD, effective_size, smoothed
+from .result import Estimate
+
+DRAWS = 512  # a power of two
+ROWS = 32768  # draws evaluated at a time
+NU = 8.0  # degrees of freedom of the proposal
+WIDEST = 2.5  # of eta: a place that may be anywhere has 1.8
+STRAIGHT = 0.5  # of eta: what goes with a place less sure than that, to first order, goes astray
+CELLS = {1: 96, 2: 48, 3: 24}  # along the rod, of the histogram of so many places
+ANYWHERE, FLATTER = 0.1, 0.9  # the share of the histogram that is even, and its power of what is promised
+FARTHEST = 4.0  # |eta| of the proposal's centre
+ENOUGH = 0.1  # of the draws: a smaller effective size asks for another round
+PLENTY = 0.3  # with so many, a k-hat up to 1 will do
+ROUNDS = 3  # of matched proposals
+SURVIVE = 0.5  # of the draws, from one temperature to the next
+MOVES = 3  # Metropolis steps at a temperature
+LAST_MOVES = 8
+MOST_TEMPERATURES = 40
+FINE = 2.5e-4  # of the length: markers less exact than that cannot tell COARSE_STEPS from the fit's own
+NEWTON = 6
+SETTLED = 1.0  # of the tip's cost: from there one more Newton step is exact to second order
+
+
+class Method(IntEnum):
+    """How the draws of a sample were come by; `.label` names it."""
+
+    NONE = 0
+    IMPORTANCE = 1
+    MATCHED = 2
+    TEMPERED = 3
+
+    @property
+    def label(self) -> str:
+        """For files."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True)
+class Draws:
+    """D draws of x of B samples, in equilibrium, in the units of Problem.state.
+
+    x (B, D, n), weight (B, D), which sum to 1. k_hat (B,): Pareto's shape of the weights; above 0.7 they are not to be trusted.
+    ess (B,): to how many independent draws they amount. log_evidence (B,): log of the mean unnormalized weight, the marginal
+    likelihood of the unknowns up to what all of a sample's hypotheses share: the larger, the better they explain it. method
+    (B,): Method codes. NaN throughout where the fit has not converged.
+    """
+
+    problem: Problem = field(repr=False)
+    x: Float[Tensor, "B D n"]
+    weight: Float[Tensor, "B D"]
+    k_hat: Float[Tensor, " B"]
+    ess: Float[Tensor, " B"]
+    log_evidence: Float[Tensor, " B"]
+    method: Int[Tensor, " B"]
+
+
+@cache
+def _student(size: int, count: int, seed: int) -> Float[Tensor, "D m"]:
+    """Points of a standard Student's t with NU degrees of freedom in so many dimensions: Sobol points, always the same."""
+    uniform = SobolEngine(size + 1, scramble=True, seed=seed).draw(count, dtype=DTYPE).clamp(1e-9, 1 - 1e-9)
+    spread = torch.from_numpy(chdtri(NU, uniform[:, -1].numpy()))
+    return torch.special.ndtri(uniform[:, :-1]) * (NU / spread).sqrt().unsqueeze(-1)
+
+
+@dataclass(frozen=True)
+class _Proposal:
+    """Student's t of b samples: centre (b, m), and L with L L^T its scale matrix."""
+
+    centre: Float[Tensor, "b m"]
+    L: Float[Tensor, "b m m"]
+
+    @classmethod
+    def of(cls, centre: Float[Tensor, "b m"], C: Float[Tensor, "b m m"]) -> "_Proposal":
+        """By a factor of C, of which directions that are none are given a little."""
+        d = C.diagonal(dim1=-2, dim2=-1).clamp(min=1e-24).sqrt()
+        size, axes = torch.linalg.eigh(C / d.unsqueeze(-1) / d.unsqueeze(-2))
+        R = (axes * size.clamp(min=1e-10).sqrt().unsqueeze(-2)).mT
+        L = torch.linalg.qr(R)[1].mT
+        return cls(centre, d.unsqueeze(-1) * L * L.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2))
+
+    def take(self, index: Int[Tensor, " c"]) -> "_Proposal":
+        return _Proposal(self.centre[index], self.L[index])
+
+    def draw(self, count: int, seed: int) -> Float[Tensor, "b D m"]:
+        return self.centre.unsqueeze(1) + _student(self.centre.shape[-1], count, seed) @ self.L.mT
+
+    def log_density(self, v: Float[Tensor, "b D m"]) -> Float[Tensor, "b D"]:
+        m = v.shape[-1]
+        off = torch.linalg.solve_triangular(self.L, (v - self.centre.unsqueeze(1)).mT, upper=False)
+        constant = math.lgamma((NU + m) / 2) - math.lgamma(NU / 2) - 0.5 * m * math.log(NU * math.pi)
+        size = self.L.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1, keepdim=True)
+        return constant - size - 0.5 * (NU + m) * torch.log1p(off.square().sum(-2) / NU)
+
+
+@cache
+def _combinations(cells: int, K: int) -> tuple[Int[Tensor, "c K"], Int[Tensor, " lut"]]:
+    """K cells in rising order, and which combination each K cells are, by their number in the base `cells`; -1: none."""
+    cell = torch.combinations(torch.arange(cells), K)
+    base = cells ** torch.arange(K)
+    return cell, torch.full((cells**K,), -1).index_copy(0, (cell * base).sum(-1), torch.arange(len(cell)))
+
+
+@dataclass(frozen=True)
+class _OnGrid:
+    """Places of the loads by a histogram of how probable they are, all else by a Student's t.
+
+    rest: that t, of the other entries. places: those of the etas, in the order along the rod. share (b, c): of each combination.
+    """
+
+    rest: _Proposal
+    places: Int[Tensor, "b K"]
+    others: Int[Tensor, " r"]
+    cells: int
+    share: Float[Tensor, "b c"]
+
+    def take(self, index: Int[Tensor, " c"]) -> "_OnGrid":
+        return replace(self, rest=self.rest.take(index), places=self.places[index], share=self.share[index])
+
+    def draw(self, count: int, seed: int) -> Float[Tensor, "b D m"]:
+        (b, K), r = self.places.shape, len(self.others)
+        uniform = SobolEngine(K + 1, scramble=True, seed=100 + seed).draw(count, dtype=DTYPE).clamp(1e-6, 1 - 1e-6)
+        ends = self.share.cumsum(-1)
+        which = torch.searchsorted((ends / ends[:, -1:]).contiguous(), uniform[:, 0].expand(b, -1).contiguous())
+        cell, _ = _combinations(self.cells, K)
+        eta = torch.logit((cell[which.clamp(max=len(cell) - 1)] + uniform[:, 1:]) / self.cells)
+        v = eta.new_zeros(b, count, K + r)
+        v[..., self.others] = self.rest.draw(count, seed)
+        return v.scatter(-1, self.places.unsqueeze(1).expand(-1, count, -1), eta)
+
+    def log_density(self, v: Float[Tensor, "b D m"]) -> Float[Tensor, "b D"]:
+        K = self.places.shape[-1]
+        at = torch.sigmoid(v.gather(-1, self.places.unsqueeze(1).expand(-1, v.shape[1], -1)))
+        cell = (at * self.cells).long().clamp(max=self.cells - 1)
+        _, table = _combinations(self.cells, K)
+        which = table[(cell * self.cells ** torch.arange(K)).sum(-1)]
+        share = torch.where(which >= 0, self.share.gather(-1, which.clamp(min=0)), 0.0)
+        slope = (at * (1 - at)).clamp(min=1e-300).log().sum(-1) + K * math.log(self.cells)
+        return share.log() + slope + self.rest.log_density(v[..., self.others])
+
+
+def _exactly(problem: Problem) -> Problem:
+    """The problem on as many steps as its markers can tell."""
+    markers = problem.markers
+    if markers is None:
+        return problem
+    noise = markers.noise.min() if isinstance(markers.noise, Tensor) else markers.noise
+    return problem.coarse if float(noise) > FINE * problem.robot.rod.length else problem
+
+
+class _Target:
+    """log pi of draws of the samples of a problem."""
+
+    def __init__(self, problem: Problem, x: Float[Tensor, "B n"], C: Float[Tensor, "B n n"], nu: float):
+        self.problem, self.nu, self.x = _exactly(problem), nu, x
+        self.chart = Chart.at(self.problem, x)
+        m = self.chart.size
+        follow = ekf.solve_spd(C[:, :m, :m], C[:, :m, m:]).mT if m else C.new_zeros(len(C), TIP_ROWS, 0)
+        self.follow = follow.nan_to_num(0.0)  # d alpha / dy along the equilibria near the fit
+        self._spread: tuple[Int[Tensor, " b"], int, Chart, Evaluator] | None = None
+        state, robot = problem.state, problem.robot
+        self.light = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and not bool((robot.weight != 0).any())
+
+    def _of(self, index: Int[Tensor, " b"], count: int) -> tuple[Chart, Evaluator]:
+        """The chart of samples of an index, and the evaluator of so many draws of each."""
+        kept = self._spread
+        if kept is None or kept[1] != count or not torch.equal(kept[0], index):
+            spread = self.problem.take(index.repeat_interleave(count))
+            self._spread = kept = (index, count, self.chart.take(index), evaluator(spread, self.nu))
+        return kept[2:]
+
+    def __call__(self, v: Float[Tensor, "b D m"], index: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b D"], Float[Tensor, "b D n"]]:
+        """log pi and x in equilibrium, of samples of an index."""
+        b, D, _ = v.shape
+        chart, evaluate = self._of(index, D)
+        y, log_volume = chart.back(v)
+        flat, rows = y.flatten(0, 1), index.repeat_interleave(D)
+        cost, x = self._by_one_walk(evaluate, flat) if self._walks(evaluate) else self._by_newton(evaluate, flat, rows)
+        cost, x = cost.unflatten(0, (b, D)), x.unflatten(0, (b, D))
+        for near, far in itertools.pairwise(chart.in_order.mT):  # the same loads in another order are no other explanation
+            apart = y.gather(-1, far.expand(D, 1, b).movedim(-1, 0)) - y.gather(-1, near.expand(D, 1, b).movedim(-1, 0))
+            log_volume = torch.where(apart.squeeze(-1) >= 0, log_volume, -torch.inf)
+        log_pi = -0.5 * (cost - (chart.fitted_prior(x) if self._walks(evaluate) else 0.0)) + chart.log_prior(y) + log_volume
+        return log_pi.nan_to_num(-torch.inf, -torch.inf, -torch.inf), x
+
+    def _walks(self, evaluate: Evaluator) -> bool:
+        return self.light and isinstance(evaluate, KernelEvaluator)
+
+    def _by_one_walk(self, evaluate: Evaluator, y: Float[Tensor, "N m"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
+        assert isinstance(evaluate, KernelEvaluator)
+        state = self.problem.state
+        wrench, _, _ = evaluate.balance(y[:, state.loads.at].contiguous(), None, 1, 1.0)
+        x = torch.cat([y, wrench / state.base.unit], -1)
+        return evaluate.cost(x), x
+
+    def _by_newton(
+        self, evaluate: Evaluator, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
+        """The cost without the prior, by Newton steps on the base wrench until the tip residual is nothing."""
+        m = self.chart.size
+        off = y - self.x[rows, :m]
+        x = torch.cat([y, self.x[rows, m:] + (self.follow[rows] @ off.unsqueeze(-1)).squeeze(-1)], -1)
+        cost = x.new_full((len(x),), torch.inf)
+        live = torch.arange(len(x))
+        for _ in range(NEWTON):
+            part = evaluate.take(live) if len(live) < len(x) else evaluate
+            found = part.sums(x[live])
+            step = ekf.solve_spd(found.A[:, 1, m:, m:], found.g[:, 1, m:].unsqueeze(-1)).squeeze(-1).nan_to_num(0.0)
+            A, g = found.A[:, 0, m:, m:], found.g[:, 0, m:]
+            change = ((A @ step.unsqueeze(-1)).squeeze(-1) * step).sum(-1) - 2 * (g * step).sum(-1)
+            done = found.cost[:, 1] < SETTLED
+            cost[live[done]] = (found.cost[:, 0] + change)[done]
+            x[live, m:] += step
+            live = live[~done & torch.isfinite(found.cost[:, 1])]
+            if not len(live):
+                break
+        return cost, x
+
+
+def _matched(v: Float[Tensor, "b D m"], log_weight: Float[Tensor, "b D"]) -> _Proposal:
+    """From the weighted mean and covariance; where few draws have all of the weight, of weights to a small power."""
+    m, power = v.shape[-1], log_weight.new_ones(len(v), 1)
+    flat = log_weight.clamp(min=-1e4)
+    for _ in range(8):
+        weight = torch.softmax(power * flat, -1)
+        few = 1 / weight.square().sum(-1, keepdim=True) < 4 * m + 4
+        power = torch.where(few, 0.5 * power, power)
+    weight = torch.softmax(power * flat, -1)
+    centre = (weight.unsqueeze(-1) * v).sum(1)
+    off = v - centre.unsqueeze(1)
+    return _Proposal.of(centre, 1.1 * (weight.unsqueeze(-1) * off).mT @ off)
+
+
+def systematic(weight: Float[Tensor, "b D"], count: int) -> Int[Tensor, "b C"]:
+    """Which draws to take for so many of equal weight."""
+    at = (torch.arange(count, dtype=weight.dtype) + 0.5) / count
+    ends = weight.cumsum(-1)
+    return torch.searchsorted((ends / ends[:, -1:]).contiguous(), at.expand(len(weight), -1).contiguous()).clamp(
+        max=weight.shape[-1] - 1
+    )
+
+
+def picked(values: Float[Tensor, "b D m"], index: Int[Tensor, "b C"]) -> Float[Tensor, "b C m"]:
+    """The draws of an index of each sample."""
+    return values.gather(1, index.unsqueeze(-1).expand(-1, -1, values.shape[-1]))
+
+
+@dataclass
+class _Found:
+    """What has come of b samples."""
+
+    x: Float[Tensor, "b D n"]
+    log_weight: Float[Tensor, "b D"]
+    k_hat: Float[Tensor, " b"]
+    ess: Float[Tensor, " b"]
+    log_evidence: Float[Tensor, " b"]
+    method: Int[Tensor, " b"]
+
+    def put(self, rows: Int[Tensor, " c"], other: "_Found") -> None:
+        for name in ("x", "log_weight", "k_hat", "ess", "log_evidence", "method"):
+            getattr(self, name)[rows] = getattr(other, name)
+
+
+def _importance(target: _Target, first: list[tuple["_Proposal | _OnGrid", int]], count: int) -> _Found:
+    """(2), with as many rounds of matched proposals as k-hat asks for, and tempering where that does not help.
+
+    first: the proposals to begin with, and how many draws of each, `count` in all.
+    """
+    proposals = [p for p, _ in first]
+    shares = [k for _, k in first]
+    index, seen = torch.arange(len(target.x)), torch.cat([p.draw(k, i) for i, (p, k) in enumerate(first)], 1)
+    log_pi, x = target(seen, index)
+    found = _weighed(proposals, shares, seen, log_pi, x, Method.IMPORTANCE)
+    where = _poor(found, count).nonzero().squeeze(-1)
+    proposals, seen, log_pi, x = _of(where, proposals, seen, log_pi, x)
+    log_weight = found.log_weight[where]
+    for turn in range(ROUNDS):
+        if not len(where):
+            return found
+        new = _matched(seen, log_weight)
+        fresh = new.draw(count, 10 + turn)
+        shares = [*shares, count]
+        log_fresh, x_fresh = target(fresh, where)
+        proposals, seen = [*proposals, new], torch.cat([seen, fresh], 1)
+        log_pi, x = torch.cat([log_pi, log_fresh], 1), torch.cat([x, x_fresh], 1)
+        again = _weighed(proposals, shares, seen, log_pi, x, Method.MATCHED)
+        log_weight = again.log_weight
+        poor = _poor(again, count)
+        if turn == ROUNDS - 1:  # many draws that count, and the largest of them not too large: as good as tempered ones
+            poor = poor & ~((again.k_hat < 1) & (again.ess > PLENTY * count))
+        fine = (~poor | (turn == ROUNDS - 1)).nonzero().squeeze(-1)
+        pick = systematic(again.log_weight[fine].exp(), count)
+        equal = log_weight.new_full((len(fine), count), -math.log(count))
+        numbers = (again.k_hat[fine], again.ess[fine].clamp(max=count), again.log_evidence[fine], again.method[fine])
+        found.put(where[fine], _Found(picked(x[fine], pick), equal, *numbers))
+        rest = poor.nonzero().squeeze(-1)
+        where, log_weight = where[rest], log_weight[rest]
+        proposals, seen, log_pi, x = _of(rest, proposals, seen, log_pi, x)
+    if len(where):
+        found.put(where, _tempered(target, where, proposals[-1], count))
+    return found
+
+
+def _of(rows: Int[Tensor, " c"], proposals: list["_Proposal | _OnGrid"], *tensors: Tensor) -> tuple:
+    return [p.take(rows) for p in proposals], *(t[rows] for t in tensors)
+
+
+def _poor(found: _Found, count: int) -> Bool[Tensor, " b"]:
+    return ~(found.k_hat <= GOOD) | (found.ess < ENOUGH * count)
+
+
+def _weighed(
+    proposals: list["_Proposal | _OnGrid"],
+    shares: list[int],
+    v: Float[Tensor, "b D m"],
+    log_pi: Float[Tensor, "b D"],
+    x: Float[Tensor, "b D n"],
+    method: Method,
+) -> _Found:
+    """Draws of a mixture of proposals, so many of each."""
+    parts = [p.log_density(v) + math.log(k / sum(shares)) for p, k in zip(proposals, shares, strict=True)]
+    raw = _difference(log_pi, torch.stack(parts).logsumexp(0))
+    log_weight, k = smoothed(raw)
+    evidence = raw.logsumexp(-1) - math.log(raw.shape[-1])
+    return _Found(x, log_weight, k, effective_size(log_weight), evidence, torch.full((len(v),), int(method)))
+
+
+@dataclass
+class _Walkers:
+    """Draws of c samples on their way from q to pi."""
+
+    target: _Target
+    index: Int[Tensor, " c"]
+    q: _Proposal
+    v: Float[Tensor, "c D m"]
+    log_pi: Float[Tensor, "c D"]
+    x: Float[Tensor, "c D n"]
+    reach: Float[Tensor, " c"]
+    random: torch.Generator
+
+    def __post_init__(self):
+        self.log_q = self.q.log_density(self.v)
+
+    def survive(self, share: Float[Tensor, " c"]) -> tuple[Float[Tensor, " c"], Float[Tensor, " c"]]:
+        """Resample for b larger by `share`: the effective size of that, and the log of the mean weight."""
+        log_weight = share.unsqueeze(-1) * _difference(self.log_pi, self.log_q)
+        mean = log_weight.logsumexp(-1) - math.log(log_weight.shape[-1])
+        weight = torch.softmax(log_weight, -1)
+        pick = systematic(weight, weight.shape[-1])
+        self.v, self.x = picked(self.v, pick), picked(self.x, pick)
+        self.log_pi, self.log_q = self.log_pi.gather(1, pick), self.log_q.gather(1, pick)
+        return 1 / weight.square().sum(-1), mean
+
+    def move(self, b: Float[Tensor, " c"]) -> None:
+        """A Metropolis step of every draw, alternately along the draws' covariance and along the difference of two of them."""
+        _, D, m = self.v.shape
+        off = self.v - self.v.mean(1, keepdim=True)
+        L = _Proposal.of(self.v[:, 0], off.mT @ off / D).L
+        z = torch.randn(D, m, generator=self.random, dtype=DTYPE)
+        i, j = (torch.randperm(D, generator=self.random) for _ in range(2))
+        uniform, jump = torch.rand(D, generator=self.random, dtype=DTYPE), torch.rand(D, generator=self.random, dtype=DTYPE)
+        by_one = (2.38 / math.sqrt(m) * self.reach)[:, None, None] * (z @ L.mT)
+        size = torch.where(jump < 0.1, 1.0, 2.38 / math.sqrt(2 * m)) * self.reach.unsqueeze(-1)
+        by_two = size.unsqueeze(-1) * (self.v[:, i] - self.v[:, j]) + 1e-3 * by_one
+        v = self.v + torch.where((torch.arange(D) % 2 == 0)[None, :, None], by_one, by_two)
+        log_pi, x = self.target(v, self.index)
+        log_q = self.q.log_density(v)
+        here, there = ((1 - b).unsqueeze(-1) * q + b.unsqueeze(-1) * p for q, p in ((self.log_q, self.log_pi), (log_q, log_pi)))
+        taken = uniform.log() < _difference(there, here)
+        self.v, self.x = (torch.where(taken.unsqueeze(-1), new, old) for new, old in ((v, self.v), (x, self.x)))
+        self.log_pi, self.log_q = torch.where(taken, log_pi, self.log_pi), torch.where(taken, log_q, self.log_q)
+        rate = taken.to(DTYPE).mean(-1)
+        self.reach = (self.reach * torch.exp(2 * (rate - 0.25))).clamp(0.02, 2.0)
+
+
+def _difference(a: Float[Tensor, "c D"], b: Float[Tensor, "c D"]) -> Float[Tensor, "c D"]:
+    """a - b, -inf where a is."""
+    return torch.where(torch.isneginf(a), -torch.inf, a - b).nan_to_num(torch.inf, torch.inf, -torch.inf)
+
+
+def _next_share(log_ratio: Float[Tensor, "c D"], left: Float[Tensor, " c"]) -> Float[Tensor, " c"]:
+    """The largest share of pi / q by which at least SURVIVE of the draws survive, by bisection; all that is left, if it does."""
+    low, high = torch.zeros_like(left), left.clone()
+
+    def lives(share: Float[Tensor, " c"]) -> Bool[Tensor, " c"]:
+        weight = torch.softmax(share.unsqueeze(-1) * log_ratio, -1)
+        return 1 / weight.square().sum(-1) >= SURVIVE * log_ratio.shape[-1]
+
+    whole = lives(high)
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        good = lives(middle)
+        low, high = torch.where(good, middle, low), torch.where(good, high, middle)
+    return torch.where(whole, left, low.clamp(min=1e-6).minimum(left))
+
+
+def _tempered(target: _Target, index: Int[Tensor, " c"], q: _Proposal, count: int) -> _Found:
+    """Sequential Monte Carlo from q to pi."""
+    v = q.draw(count, 20)
+    log_pi, x = target(v, index)
+    c = len(index)
+    walkers = _Walkers(target, index, q, v, log_pi, x, v.new_ones(c), torch.Generator().manual_seed(1))
+    b, evidence, size = v.new_zeros(c), v.new_zeros(c), v.new_full((c,), float(count))
+    for _ in range(MOST_TEMPERATURES):
+        if bool((b >= 1).all()):
+            break
+        share = _next_share(_difference(walkers.log_pi, walkers.log_q).clamp(-1e6, 1e6), 1 - b)
+        survived, mean = walkers.survive(share)
+        size, evidence = torch.where(b < 1, torch.minimum(size, survived), size), evidence + mean
+        b = (b + share).clamp(max=1.0)
+        for _ in range(MOVES):
+            walkers.move(b)
+    for _ in range(LAST_MOVES):
+        walkers.move(b)
+    level = walkers.log_pi.new_full((c, count), -math.log(count))
+    distinct = torch.tensor([len(row.unique()) for row in walkers.log_pi], dtype=DTYPE)
+    k = torch.where(b >= 1, torch.full_like(b, 0.5), torch.inf)
+    ess = torch.where(b >= 1, torch.minimum(size, distinct), torch.zeros_like(b))
+    return _Found(walkers.x, level, k, ess, torch.where(b >= 1, evidence, torch.nan), torch.full((c,), int(Method.TEMPERED)))
+
+
+def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple["_Proposal | _OnGrid", int]]:
+    """The first proposals: the fit's covariance in the coordinates of the chart and, for some of the draws, places anywhere."""
+    chart, m = target.chart, target.chart.size
+    y = target.x[:, :m].clone()
+    for i in chart.places:
+        y[:, i] = y[:, i].clamp(-FARTHEST, FARTHEST)
+    near = chart.to(y.unsqueeze(1)).squeeze(1)
+    J, K = chart.slope(y), len(chart.places)
+    C = J @ C[:, :m, :m] @ J.mT
+    if chart.response is None:
+        return [(_Proposal.of(near, C), count)]
+    at, others = torch.tensor(chart.places), torch.tensor([i for i in range(m) if i not in chart.places])
+    C_at, C_both = C[:, at][:, :, at], C[:, others][:, :, at]
+    follow = ekf.solve_spd(C_at, C_both.mT).mT.nan_to_num(0.0)
+    C_rest = C[:, others][:, :, others] - follow @ C_both.mT
+    std = C_at.diagonal(dim1=-2, dim2=-1).sqrt()
+    shrink = (WIDEST / std).clamp(max=1.0)
+    C_at = C_at * shrink.unsqueeze(-1) * shrink.unsqueeze(-2)
+    follow = torch.where((std > STRAIGHT).any(-1)[:, None, None], 0.0, follow)
+    whole = torch.zeros_like(C)
+    whole[:, at.unsqueeze(-1), at], whole[:, others.unsqueeze(-1), at] = C_at, follow @ C_at
+    whole[:, at.unsqueeze(-1), others] = (follow @ C_at).mT
+    whole[:, others.unsqueeze(-1), others] = C_rest + follow @ C_at @ follow.mT
+    local = _Proposal.of(near, whole)
+    if K not in CELLS:
+        return [(local, count)]
+    cell, _ = _combinations(CELLS[K], K)
+    eta = torch.logit((cell.to(DTYPE) + 0.5) / CELLS[K])
+    order = chart.in_order
+    rank = (order.unsqueeze(-1) == at).long().argmax(1) if K > 1 else torch.zeros(len(y), 1, dtype=torch.int64)
+    log_share = chart.log_marginal(eta[:, rank].movedim(1, 0))
+    log_share = (log_share - torch.sigmoid(eta).mul(1 - torch.sigmoid(eta)).log().sum(-1)).nan_to_num(-torch.inf)
+    share = (1 - ANYWHERE) * torch.softmax(FLATTER * log_share, -1) + ANYWHERE / len(cell)
+    centre = near[:, others].clone()
+    centre[:, [i for i, k in enumerate(others.tolist()) if k in chart.linear.tolist()]] = 0.0
+    grid = _OnGrid(_Proposal.of(centre, C_rest), order, others, CELLS[K], share)
+    return [(local, count // 2), (grid, count - count // 2)]
+
+
+def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu: float = math.inf) -> Draws:
+    """Draws of the posterior of x of every sample that has converged: see the module.
+
+    problem: the one that was fitted. estimate: its fit. draws: how many of each sample, a power of two. nu: degrees of freedom of
+    Student's t of a robust fit. Costs 10 us a draw for a rod without weight, 30 to 100 for other robots (docs/coverage.md). Errors:
+    ValueError for an estimate of other unknowns. Source: Vehtari et al., JMLR 2024.
+    """
+    n, B = problem.size, problem.batch
+    if estimate.x.shape != (B, n):
+        raise ValueError(f"the estimate has x of shape {tuple(estimate.x.shape)}; this problem needs {(B, n)}")
+    x = torch.full((B, draws, n), torch.nan, dtype=DTYPE)
+    weight = torch.full((B, draws), torch.nan, dtype=DTYPE)
+    k_hat, ess, evidence = (torch.full((B,), torch.nan, dtype=DTYPE) for _ in range(3))
+    method = torch.zeros(B, dtype=torch.int64)
+    fine = (estimate.status == int(Status.CONVERGED)) & torch.isfinite(estimate.covariance).flatten(1).all(-1)
+    if not problem.state.base.at.start:  # nothing is unknown but what equilibrium gives
+        known = fine.to(DTYPE).masked_fill(~fine, torch.nan)
+        x, weight = estimate.x.unsqueeze(1).expand(B, draws, n), (known / draws).unsqueeze(-1).expand(B, draws)
+        return Draws(problem, x, weight, 0 * known, draws * known, -0.5 * estimate.cost * known, fine * int(Method.IMPORTANCE))
+    with torch.inference_mode(False), one_thread():
+        for rows in fine.nonzero().squeeze(-1).split(max(1, ROWS // draws)):
+            part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
+            C = estimate.covariance[rows]
+            target = _Target(part, estimate.x[rows], C, nu)
+            found = _importance(target, _about(target, C, draws), draws)
+            x[rows], weight[rows] = found.x, found.log_weight.exp()
+            alike = math.lgamma(len(target.chart.places) + 1)  # as many orders of the loads, of which the draws have one
+            k_hat[rows], ess[rows], evidence[rows] = found.k_hat, found.ess, found.log_evidence + alike
+            method[rows] = found.method
+    return Draws(problem, x, weight, k_hat, ess, evidence, method)

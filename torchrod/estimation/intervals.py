@@ -1,0 +1,123 @@
+"""95 % intervals and bands from draws of the posterior: of forces, places, resultant, tip wrench and the load profile."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..model.problem import Problem
+from ..model.unknowns import Unknowns
+from ..util.precision import DTYPE
+from .draws import DRAWS, Draws, picked, posterior_draws, systematic
+from .load_profile import DRAWS as OF_BAND
+from .load_profile import LEVELS, NODES, band_of_draws
+from .result import Estimate
+
+CHUNK = 64  # samples at a time: their draws are not kept
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1).
+
+    magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame. resultant (B, 4, 2) N: of the
+    three components, in the base frame, and the size of all loads on the rod together, without weight and tip. tip (B, 6, 2) [N,
+    N m]: the unknown wrench at the tip, or None. band (B, S, 3, 2) N/m: of f_x, f_y and |f| at evenly spaced places from base to
+    tip, or None for point loads. k_hat, ess, method (B,): see Draws.
+    """
+
+    magnitude: Float[Tensor, "B K 2"]
+    location: Float[Tensor, "B K 2"]
+    force: Float[Tensor, "B K 2 2"]
+    resultant: Float[Tensor, "B 4 2"]
+    tip: Float[Tensor, "B 6 2"] | None
+    band: Float[Tensor, "B S 3 2"] | None
+    k_hat: Float[Tensor, " B"]
+    ess: Float[Tensor, " B"]
+    method: Int[Tensor, " B"]
+
+
+def quantiles(values: Float[Tensor, "B D k"], weight: Float[Tensor, "B D"]) -> Float[Tensor, "B k 2"]:
+    """The weighted quantiles of LEVELS, linear between the draws."""
+    ordered, order = values.movedim(1, -1).sort(-1)
+    share = weight.unsqueeze(1).expand(-1, values.shape[-1], -1).gather(-1, order)
+    ends = share.cumsum(-1) - 0.5 * share
+    found = []
+    for level in LEVELS:
+        i = torch.searchsorted(ends.contiguous(), torch.full_like(ends[..., :1], level)).clamp(1, ends.shape[-1] - 1)
+        (e0, e1), (v0, v1) = ((t.gather(-1, i - 1), t.gather(-1, i)) for t in (ends, ordered))
+        found.append(v0 + ((level - e0) / (e1 - e0).clamp(min=1e-300)).clamp(0, 1) * (v1 - v0))
+    return torch.cat(found, -1)
+
+
+def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:
+    """Of all loads on the rod (N, base frame): what the base carries, less the weight and what acts on the tip."""
+    state, robot = problem.state, problem.robot
+    return state.base.of(x)[..., :3] - state.tip_wrench(x)[..., :3] - robot.rod.mass * robot.gravity
+
+
+def intervals(draws: Draws) -> Intervals:
+    """The intervals of draws."""
+    problem, x, weight = draws.problem, draws.x, draws.weight
+    family, state = problem.unknowns.loads, problem.state
+    gamma = x[..., state.loads.at]
+    report, R = family.describe(gamma), resultant(problem, x)
+    values = [report.force.norm(dim=-1), report.location, report.force.flatten(-2), R, R.norm(dim=-1, keepdim=True)]
+    if state.tip.size:
+        values.append(state.tip_wrench(x))
+    K = report.location.shape[-1]
+    found = quantiles(torch.cat(values, -1), weight)
+    size, place, force, whole, tip = found.split([K, K, 2 * K, 4, found.shape[1] - 4 * K - 4], 1)
+    s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
+    band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
+    numbers = draws.k_hat, draws.ess, draws.method
+    made = Intervals(size, place, force.unflatten(1, (K, 2)), whole, tip if state.tip.size else None, band, *numbers)
+    return _masked(made, draws.k_hat <= 1)
+
+
+def _masked(made: Intervals, sound: Tensor) -> Intervals:
+    """NaN where not sound."""
+
+    def only(v: Tensor | None) -> Tensor | None:
+        return v if v is None else torch.where(sound.reshape(-1, *[1] * (v.ndim - 1)), v, torch.nan)
+
+    names = ("magnitude", "location", "force", "resultant", "tip", "band")
+    return replace(made, **{name: only(getattr(made, name)) for name in names})
+
+
+def sampled_intervals(
+    problem: Problem,
+    estimate: Estimate,
+    parts: Sequence[tuple[Unknowns, Int[Tensor, " b"]]] | None = None,
+    draws: int = DRAWS,
+    nu: float = math.inf,
+) -> Intervals:
+    """Intervals from draws of every sample; loads and entries that a sample's unknowns do not have are NaN.
+
+    parts: of the batch, each with the unknowns it was fitted by (analysis.count); None: all by the problem's. draws, nu: see
+    posterior_draws.
+    """
+    parts = [(problem.unknowns, torch.arange(problem.batch))] if parts is None else parts
+    B, K = estimate.location.shape
+    whole: dict[str, Tensor | None] = {}
+    shapes = {"magnitude": (K, 2), "location": (K, 2), "force": (K, 2, 2), "resultant": (4, 2), "k_hat": (), "ess": ()}
+    for name, shape in shapes.items():
+        whole[name] = torch.full((B, *shape), torch.nan, dtype=DTYPE)
+    whole["tip"] = None if estimate.tip is None else torch.full((B, 6, 2), torch.nan, dtype=DTYPE)
+    whole["band"], whole["method"] = torch.full((B, NODES, 3, 2), torch.nan, dtype=DTYPE), torch.zeros(B, dtype=torch.int64)
+    for unknowns, index in parts:
+        own = problem.of(unknowns) if unknowns is not problem.unknowns else problem
+        for rows in index.split(CHUNK):
+            if not len(rows):
+                continue
+            made = intervals(posterior_draws(own.take(rows), estimate.of(rows, own.size), draws, nu))
+            for f in fields(Intervals):
+                value, into = getattr(made, f.name), whole[f.name]
+                if f.name == "band" and value is None:
+                    whole["band"] = None
+                elif value is not None and into is not None:
+                    into[(rows, *(slice(0, n) for n in value.shape[1:]))] = value
+    return Intervals(**whole)  # pyright: ignore[reportArgumentType]
