@@ -201,7 +201,8 @@ def disc_by_disc(discs: int, tension: float, EI: float, r: float) -> np.ndarray:
             b = hole(end) - first
             return b[0] * d[1] - b[1] * d[0], end, pull
 
-        angle = brentq(lambda x, at=across: at(x)[0], y[2] - 0.2, y[2] + 0.8, xtol=1e-12)
+        line = brentq(lambda x, at=across: at(x)[0], y[2] - 0.2, y[2] + 0.8, xtol=1e-12)
+        angle = float(line)  # pyright: ignore[reportArgumentType]
         _, y, tau = across(angle)
         way = angle
     return y[:2]

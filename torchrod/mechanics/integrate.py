@@ -18,7 +18,7 @@ from .lie import Vector
 from .section import MATRICES, STATE, Section, StageTable, State, rk4_step
 
 
-def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bool = False) -> Float[Tensor, "... S1 13"]:
+def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bool = False) -> Float[Tensor, "... S1 state"]:
     """The state at every node, in the order of the nodes; `reverse` starts from the last node.
 
     Where tendons rub, y may have Theta of every one behind it, as the answer then has; else they have not turned so far.
@@ -80,14 +80,14 @@ def known(
 
 def march_linearized(
     section: Section,
-    y0: Float[Tensor, "B 13"],
-    dy0: Float[Tensor, "B 13 n"],
+    y0: Float[Tensor, "B state"],
+    dy0: Float[Tensor, "B state n"],
     table: StageTable,
     dlocal: Float[Tensor, "B S 3 6 g"] | None,
     grid: Grid,
     keep: Int[Tensor, "*B P"],
     reverse: bool = False,
-) -> tuple[Float[Tensor, "B P 13"], Float[Tensor, "B P 13 n"]]:
+) -> tuple[Float[Tensor, "B P state"], Float[Tensor, "B P state n"]]:
     """States at the nodes `keep` and their derivatives along n tangents.
 
     The nodes stay where they are. Tangent k moves the first state by dy0[..., k] and, where k < g, the local load integrals
@@ -103,7 +103,7 @@ def march_linearized(
     n, loads = dy0.shape[-1], table.loads
     G, G2 = loads.G, loads.G2
 
-    def walk(y0: State, *local: Vector) -> Float[Tensor, "B P 13"]:
+    def walk(y0: State, *local: Vector) -> Float[Tensor, "B P state"]:
         moved = replace(table, loads=replace(loads, G=local[0], G2=local[1])) if local else table
         return states_at(march(section, y0, moved, grid, reverse), keep)
 

@@ -31,7 +31,7 @@ from .lie import Matrix, Vector, cross, inverse3, matvec, normalized, quaternion
 from .loads import LoadIntegrals
 from .tendons import TendonTable, balanced_strains, turning_rate
 
-State = Float[Tensor, "... 13"]  # with Theta of every tendon behind it where there is friction
+State = Float[Tensor, "... state"]  # 13 numbers, with Theta of every tendon behind it where there is friction
 STATE_PARTS = [3, 4, 3, 3]
 STATE = sum(STATE_PARTS)
 MATRICES = ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")  # of a section

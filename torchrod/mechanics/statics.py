@@ -195,7 +195,8 @@ class _Sizes:
         h, end = nodes.diff(dim=-1), nodes[..., 1:]
 
         def sizes(x: Vector | None) -> Float[Tensor, "B S"]:
-            return zero.expand(-1, h.shape[-1]) if x is None else zero + x.detach()[..., 0, :].norm(dim=-1)
+            found = zero if x is None else zero + x.detach()[..., 0, :].norm(dim=-1)
+            return found.expand(-1, h.shape[-1])
 
         def softening(n: Float[Tensor, "B S"], m: Float[Tensor, "B S"]) -> Float[Tensor, " B"]:
             return (n * end * h).sum(-1) + (m.square() * end * h).sum(-1).sqrt()
@@ -566,7 +567,7 @@ def stable_at(
         return _stable(problem, q_tip, sizes.unique_below(robot), sizes.pieces(robot))
 
 
-def _marched(whole: TipProblem, problem: TipProblem, q_tip: Quaternion) -> Float[Tensor, "B P1 13"]:
+def _marched(whole: TipProblem, problem: TipProblem, q_tip: Quaternion) -> Float[Tensor, "B P1 state"]:
     """The states at the outputs and the base, with their first derivatives.
 
     The tip's orientation solves r(q, theta) = 0, so that dq = -J^-1 dr: one more Newton step from the solution, J held, has just

@@ -41,7 +41,7 @@ class TipProblem:
         return replace(self, table=self.table.take(index), grid=self.grid.take(index), wrench=self.wrench[index], turned=turned)
 
     def march(
-        self, q_tip: Float[Tensor, "B 4"], dq_tip: Float[Tensor, "B 4 n"], fraction: Float[Tensor, " B"], keep: Int[Tensor, "*B P"]
+        self, q_tip: Float[Tensor, "B 4"], dq_tip: Float[Tensor, "B m n"], fraction: Float[Tensor, " B"], keep: Int[Tensor, "*B P"]
     ) -> tuple[Float[Tensor, "B P c"], Float[Tensor, "B P c n"]]:
         """States at the nodes `keep`, and their derivatives when the tip's orientation moves along dq_tip.
 
