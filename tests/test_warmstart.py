@@ -230,14 +230,15 @@ def test_a_failed_guess_is_followed_by_all_of_a_cold_start():
     s, force = torch.linspace(0.02, 0.4, 20), T([[[4.91, 0.0, 0.0]]])
     p = solve_shape(rod, (PointForces(force, T([[0.379]])),), None, s, 1, 160).p
     problem = seen(Markers(s, p, NOISE), rod)
-    cold = estimate(problem)
+    plain = Settings(basins=0)
+    cold = estimate(problem, plain)
     assert cold.restarts[0] > 0
     assert cold.accepted[0], "of the case: it needs a restart, which helps"
 
     def stuck(problem):
-        return Start.at(estimate(problem, Settings(restarts=())).x, Origin.LEARNED, challenged=True)
+        return Start.at(estimate(problem, replace(plain, restarts=())).x, Origin.LEARNED, challenged=True)
 
-    fit = estimate(problem, start=stuck)
+    fit = estimate(problem, plain, start=stuck)
     assert (fit.guess[0], fit.fate[0]) == (int(Origin.LEARNED), int(Fate.RETRIED))
     assert fit.accepted[0]
     assert torch.allclose(fit.force, cold.force, atol=1e-3)

@@ -229,7 +229,7 @@ def _with_one_less(x: Float[Tensor, "b m"], more: Problem, fewer: Problem, dropp
 
 def _that_show_a_load(problem: Problem, candidates: Sequence[Hypothesis]) -> Problem:
     """The problem with nothing read of samples that have too few readings for the simplest hypothesis with a load."""
-    problems = [problem.of(h.unknowns) for h in candidates]
+    problems = [problem.of(h.unknowns) for h in candidates if not h.spare]
     loaded = [p for p in problems if p.state.external.stop]
     simplest = min(loaded or problems[:1], key=lambda p: p.state.free_size)
     simplest.check()

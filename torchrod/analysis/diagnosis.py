@@ -81,8 +81,10 @@ class Diagnosis:
     @cached_property
     def told(self) -> list[bool]:
         """Of which samples there is something to say."""
-        by_tensor = (torch.isfinite(self.registration).all(-1) | self.one_more).tolist()
-        return [any(parts) for parts in zip(by_tensor, self.exchanged, self.geometry, self.outliers, strict=True)]
+        doubt = torch.isfinite(self.registration).all(-1) | self.one_more | torch.isfinite(self.couple) | self.tip_instead
+        others = self.others or [()] * len(doubt)
+        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others)
+        return [any(parts) for parts in zip(*by_kind, strict=True)]
 
     def message(self, sample: int) -> str:
         """Sentences with the remedy, or nothing."""

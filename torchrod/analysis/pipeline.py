@@ -18,6 +18,7 @@ from ..estimation.starts import StartRule, cold_start
 from ..learned.warm_start import find_warm_start
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
+from ..model.sensors import TipWrench
 from ..model.unknowns import Scope, Unknowns
 from .alternatives import other_solutions
 from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, select
@@ -43,14 +44,15 @@ def contact_hypotheses(
 
     contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
     against distributed. locations: known ones (m), one for each contact. With contacts "auto" an unknown tip of the problem's
-    unknowns competes with nothing at the tip, and where none is unknown a force there is tried on samples that take two contacts
+    unknowns competes with nothing at the tip, unless a sensor reads it, and where none is unknown a force there is tried on samples that take two contacts
     or that nothing explains; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
     prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
     counts = range(MAX_CONTACTS + 1) if contacts == "auto" else [int(contacts)]
     priors = ["contact", "distributed"] if load_prior == "auto" else [load_prior]
-    tips = ["none", known.tip] if contacts == "auto" and known.tip != "none" else [known.tip]
+    competes = contacts == "auto" and known.tip != "none" and not any(isinstance(s, TipWrench) for s in problem.sensors)
+    tips = ["none", known.tip] if competes else [known.tip]
     at = None if locations is None else tuple(locations)
     found = []
     for k in counts:
