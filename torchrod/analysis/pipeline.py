@@ -44,9 +44,9 @@ def contact_hypotheses(
 
     contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
     against distributed. locations: known ones (m), one for each contact. With contacts "auto" an unknown tip of the problem's
-    unknowns competes with nothing at the tip, unless a sensor reads it, and where none is unknown a force there is tried on samples that take two contacts
-    or that nothing explains; the rest of its unknowns is part of every hypothesis. Errors: ValueError for another
-    prior.
+    unknowns competes with nothing at the tip, unless a sensor reads it; where none is unknown, a force there is tried on samples
+    that take two contacts or that nothing explains. The rest of its unknowns is part of every hypothesis. Errors: ValueError for
+    another prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
     counts = range(MAX_CONTACTS + 1) if contacts == "auto" else [int(contacts)]
