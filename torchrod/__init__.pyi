@@ -82,6 +82,7 @@ from .model.sensors import Markers as Markers
 from .model.sensors import Poses as Poses
 from .model.sensors import Sensor as Sensor
 from .model.sensors import TipWrench as TipWrench
+from .model.uncertainty import Uncertainty as Uncertainty
 from .model.unknowns import Registration as Registration
 from .model.unknowns import Scope as Scope
 from .model.unknowns import Unknowns as Unknowns

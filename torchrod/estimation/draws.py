@@ -193,7 +193,7 @@ class _Target:
         self.follow = follow.nan_to_num(0.0)  # d alpha / dy along the equilibria near the fit
         self._spread: tuple[Int[Tensor, " b"], int, Chart, Evaluator] | None = None
         state, robot = problem.state, problem.robot
-        self.light = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and not bool((robot.weight != 0).any())
+        self.light = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and robot.weightless
 
     def _of(self, index: Int[Tensor, " b"], count: int) -> tuple[Chart, Evaluator]:
         """The chart of samples of an index, and the evaluator of so many draws of each."""

@@ -104,7 +104,7 @@ def kernel_serves(problem: Problem) -> bool:
     Nodes that move with a point load take along neither a section nor a curvature nor a routing that vary.
     """
     robot, family, markers = problem.robot, family_of(problem), problem.markers
-    if markers is None or not markers.isotropic:
+    if markers is None or not markers.isotropic or problem.state.parameters.size:
         return False
     if family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False

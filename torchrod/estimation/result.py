@@ -126,6 +126,8 @@ class Estimate:
     row_residual: Float[Tensor, "B rows"]
     tension: Float[Tensor, "B T"] | None
     tension_std: Float[Tensor, "B T"] | None
+    parameters: Float[Tensor, "B m"] | None
+    parameters_std: Float[Tensor, "B m"] | None
     outlier: Bool[Tensor, "B G"]
     cost: Float[Tensor, " B"]
     chi2: Float[Tensor, " B"]
@@ -367,7 +369,7 @@ def make_estimate(
     outlier, chi2, dof, explained = verdict(evaluate, sums, cost)
     rows = sums.r[:, :-TIP_ROWS]
     tip, free = state.tip.size, state.tension.size
-    variance = state.tension.covariance(covariance).diagonal(dim1=-2, dim2=-1)
+    variance, of_parameters = (b.covariance(covariance).diagonal(dim1=-2, dim2=-1) for b in (state.tension, state.parameters))
     pad = torch.nn.functional.pad
     return Estimate(
         x=kept(x),
@@ -386,6 +388,8 @@ def make_estimate(
         row_residual=kept(rows),
         tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
         tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,
+        parameters=kept(state.parameters.of(x)) if state.parameters.size else None,
+        parameters_std=settled(of_parameters.clamp(min=0).sqrt()) if state.parameters.size else None,
         outlier=outlier,
         cost=kept(cost),
         chi2=kept(chi2),

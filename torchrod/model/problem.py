@@ -1,6 +1,6 @@
 """The problem: a robot, what is unknown of it, and what sensors read; and the model h(x) of their readings.
 
-    x = [loads, tip, tension, registration, base]   ->   h(x) = [rows of every sensor, c]
+    x = [loads, tip, tension, parameters, registration, base]   ->   h(x) = [rows of every sensor, c]
 
 c is the tip residual (17): what the section carries just beyond the tip, less R^T of the unknown wrench there. It is zero in
 equilibrium.
@@ -87,6 +87,7 @@ class Problem(Float64):
     def state(self) -> State:
         """The blocks of x, bound to this robot's scales."""
         scales = key(self.unknowns), self.robot.rod.length, self.robot.rod.bending_stiffness, len(self.robot.tendons)
+        scales = (*scales, self.robot.weightless)
         return _states(scales, lambda: self.unknowns.state(self.robot))
 
     @property
@@ -289,7 +290,38 @@ class Problem(Float64):
 
     def h(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Float[Tensor, "... z"]:
         """[rows of every sensor, c (N, N m)]: what the sensors would read, in their units, then the tip residual."""
-        return self._read(self.shape(x, differentiable), x)
+        if not self.state.parameters.size:
+            return self._read(self.shape(x, differentiable), x)
+        plain, theta = self._without_parameters(x)
+        h = self._exact.h(plain, differentiable)
+        return _parabola(h, torch.stack([other.h(plain, differentiable) for other in self._off], -1), theta)[0]
+
+    # The robot's parameters: model.uncertainty.
+
+    @cached_property
+    def _exact(self) -> "Problem":
+        """The same with a robot that is known."""
+        assert self.unknowns.uncertainty is not None
+        unknowns = replace(self.unknowns, uncertainty=None)
+        return replace(self, robot=self.unknowns.uncertainty.prepared(self.robot), unknowns=unknowns, prior=None)
+
+    @cached_property
+    def _off(self) -> list["Problem"]:
+        """With every parameter off by a standard deviation, upwards and downwards, in turn; x in the units of the exact one."""
+        exact, found = self._exact, []
+        assert self.unknowns.uncertainty is not None
+        for parameter in self.unknowns.uncertainty.parameters(self.robot):
+            for error in (parameter.std, -parameter.std):
+                robot, tension = parameter.change(exact.robot, exact.tension, error)
+                other = replace(exact, robot=robot, tension=tension)
+                vars(other)["state"] = exact.state
+                found.append(other)
+        return found
+
+    def _without_parameters(self, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... m"], Float[Tensor, "... k"]]:
+        """x without the parameters, and these, in standard deviations."""
+        at = self.state.parameters.at
+        return torch.cat([x[..., : at.start], x[..., at.stop :]], -1), x[..., at]
 
     def _read(self, shape: Shape, x: Float[Tensor, "... n"]) -> Float[Tensor, "... z"]:
         """What the sensors read of a shape."""
@@ -329,6 +361,13 @@ class Problem(Float64):
         is what is used where the nodes move with x (point loads at unknown places) or tensions are unknown.
         """
         state, family = self.state, self.unknowns.loads
+        if state.parameters.size:
+            plain, theta = self._without_parameters(x)
+            (h, H), at = self._exact.linearized(plain), state.parameters.at.start
+            off_h, off_H = (torch.stack(part, -1) for part in zip(*(other.linearized(plain) for other in self._off), strict=True))
+            h, slopes = _parabola(h, off_h, theta)
+            H, _ = _parabola(H, off_H, theta.unsqueeze(-2))
+            return h, torch.cat([H[..., :at], slopes, H[..., at:]], -1)
         gamma, alpha = x[..., state.loads.at], state.base.of(x)
         grid = grid_for(self.robot, family.loads(gamma), self.s, self.steps)
         if grid.nodes.ndim > 1 or state.tension.size:
@@ -379,3 +418,12 @@ class Problem(Float64):
         axes = vmap(column, out_dims=(None, 0))  # pyright: ignore[reportArgumentType]
         h, columns = axes(d_states, d_beyond, torch.eye(n, dtype=x.dtype))
         return h, columns.movedim(0, -1)
+
+
+def _parabola(
+    at_zero: Float[Tensor, "... z"], off: Float[Tensor, "... z k2"], theta: Float[Tensor, "... k"]
+) -> tuple[Float[Tensor, "... z"], Float[Tensor, "... z k"]]:
+    """(1) of model.uncertainty, and its derivative by theta, from the values at zero and one standard deviation to either side."""
+    up, down, theta = off[..., ::2], off[..., 1::2], theta.unsqueeze(-2)
+    slope, curve = 0.5 * (up - down), 0.5 * (up + down) - at_zero.unsqueeze(-1)
+    return at_zero + (theta * slope + theta**2 * curve).sum(-1), slope + 2 * theta * curve

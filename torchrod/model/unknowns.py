@@ -1,10 +1,11 @@
 """What is unknown: named blocks of one state vector x, each with its units, its prior and its scope.
 
-    x = [loads, tip, tension, registration, base]
+    x = [loads, tip, tension, parameters, registration, base]
 
 loads: gamma, the load family's own (model.load_families). tip: a dead force, or wrench, at the tip. tension: errors of the
-tensions' readings. registration: zeta, the twist by which the base frame is off. base: the base wrench alpha (18). A block of scope
-SHARED has one value for all samples of a problem (estimation.shared); the others have one for each.
+tensions' readings. parameters: errors of what is only nearly known of the robot (model.uncertainty). registration: zeta, the twist
+by which the base frame is off. base: the base wrench alpha (18). A block of scope SHARED has one value for all samples of a problem
+(estimation.shared); the others have one for each.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from torch import Tensor
 from ..mechanics.robot import Robot
 from ..util.precision import DTYPE
 from .load_families import LoadFamily
+from .uncertainty import Uncertainty
 
 TIP_SIZE = {"none": 0, "force": 3, "wrench": 6}
 TIP_STD = 10.0  # of the weak prior on the unknown tip force and moment about zero, in force and moment scales
@@ -89,13 +91,14 @@ class State:
     loads: Block
     tip: Block
     tension: Block
+    parameters: Block
     registration: Block
     base: Block
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """All of them in the order of x; absent ones have no entries."""
-        return self.loads, self.tip, self.tension, self.registration, self.base
+        return self.loads, self.tip, self.tension, self.parameters, self.registration, self.base
 
     @property
     def size(self) -> int:
@@ -109,8 +112,8 @@ class State:
 
     @property
     def free_size(self) -> int:
-        """How many entries only the sensors determine: not the base wrench, which (17) holds, nor tensions, which have priors."""
-        return self.size - self.base.size - self.tension.size
+        """How many entries only the sensors determine: not the base wrench, which (17) holds, nor what has a narrow prior."""
+        return self.size - self.base.size - self.tension.size - self.parameters.size
 
     @cached_property
     def informative(self) -> int:
@@ -154,6 +157,7 @@ class Unknowns:
     tension_std: float | None = None
     registration: Registration | None = None
     scaled: bool = True
+    uncertainty: Uncertainty | None = None
 
     def __post_init__(self):
         if self.tip not in TIP_SIZE:
@@ -179,6 +183,8 @@ class Unknowns:
         tip = block("tip", wrench[: TIP_SIZE[self.tip]], TIP_STD**-2)
         tendons = 0 if self.tension_std is None else len(robot.tendons)
         tension = block("tension", [self.tension_std or 0.0] * tendons, 1.0, informative=tendons)
+        nearly = () if self.uncertainty is None else self.uncertainty.parameters(robot)
+        parameters = block("parameters", [p.std for p in nearly], 1.0, informative=len(nearly))
         if self.registration is None:
             registration = block("registration", [], 0.0)
         else:
@@ -187,4 +193,4 @@ class Unknowns:
             off = [self.registration.shift_std or FRAME_SHIFT * rod.length] * 3 + [self.registration.turn_std or FRAME_TURN] * 3
             known = (zeta / torch.tensor(off, dtype=DTYPE)) ** 2
             registration = block("registration", zeta.tolist(), known, scope=self.registration.scope)
-        return State(loads, tip, tension, registration, block("base", wrench, 0.0))
+        return State(loads, tip, tension, parameters, registration, block("base", wrench, 0.0))
