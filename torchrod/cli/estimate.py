@@ -12,7 +12,7 @@ from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_o
 from ..estimation.load_profile import Profile
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
-from ..io import RESULT_SUFFIXES, Noises, Shapes, read_base_pose, read_robot, read_shapes, write_result
+from ..io import RESULT_SUFFIXES, Noises, Shapes, read_base_pose, read_robot, read_shapes, read_uncertainty, write_result
 from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
@@ -68,7 +68,9 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     rod = robot.rod
     std = options.tension_std if len(robot.tendons) else None
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
-    unknowns = Unknowns(loads, options.unknown_tip, std, _registration(options))
+    nearly = read_uncertainty(options.robot)
+    registration = _registration(options) or nearly.frame
+    unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.robot)
     stated = STATED * rod.length if noise is None else noise
     positive("--angle-noise", options.angle_noise)
     for value in options.base_noise or ():
@@ -107,6 +109,8 @@ def estimate(options: Namespace) -> None:
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
     if options.out:
         said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
+        nearly = problem.unknowns.uncertainty
+        said["parameters"] = [] if nearly is None else [p.name for p in nearly.parameters(robot)]
         said |= {"profile": _profile(options, found), "base": read_base_pose(options.robot), "time": shapes.time}
         write_result(options.out, fit, shapes.samples, robot.name, **said)
     if options.plot:

@@ -8,6 +8,7 @@ from .robot_file import read_base_pose, read_robot
 from .robot_text import write_calibrated
 from .shape_file import read_shapes, write_shapes
 from .shapes import KINDS, Noises, Shapes
+from .uncertainty import read_uncertainty
 
 __all__ = [
     "CALIBRATION_SUFFIXES",
@@ -20,6 +21,7 @@ __all__ = [
     "read_fit",
     "read_robot",
     "read_shapes",
+    "read_uncertainty",
     "unit_of",
     "write_calibrated",
     "write_calibration",

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import IO, Any
@@ -38,7 +38,7 @@ RESULT_SUFFIXES = (".json", ".npz", ".csv")
 COLUMNS = (
     *("force", "net_force", "magnitude", "magnitude_std", "magnitude_interval", "location", "location_std", "location_interval"),
     *("width", "magnitude_location_covariance", "rms_residual", "status", "accepted", "iterations", "restarts", "warm_started"),
-    *("chi2", "dof", "base_wrench", "tip", "registration", "tension", "tension_std"),
+    *("chi2", "dof", "base_wrench", "tip", "registration", "tension", "tension_std", "parameters", "parameters_std"),
 )
 Columns = dict[str, list[Any]]
 WITH_UNITS = {
@@ -213,6 +213,7 @@ def _texts(
     space: dict[str, Tensor],
     time: list[float] | None,
     drawn: Intervals | None,
+    parameters: Sequence[str],
 ) -> Iterator[str]:
     """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
     of = _columns(estimate, space, drawn)
@@ -220,6 +221,9 @@ def _texts(
         record = _record(of, b, name, _message(estimate, diagnosis, b))
         if time is not None:
             record["time_s"] = _numbers(time[b])
+        if parameters:
+            found = zip(parameters, of["parameters"][b], of["parameters_std"][b], strict=True)
+            record["parameters"] = _numbers({name: {"error": error, "std": std} for name, error, std in found})
         if evidence is not None:
             record["evidence"] = json.dumps(_evidence(evidence, b))
         if diagnosis is not None:
@@ -281,6 +285,7 @@ def write_result(
     base: BasePose | None = None,
     time: Float[Tensor, " B"] | None = None,
     intervals: Intervals | None = None,
+    parameters: Sequence[str] = (),
 ) -> None:
     """RESULT.json, RESULT.npz with the fields of torchrod.Estimate as arrays, or LOADS.csv with a row for each load.
 
@@ -288,6 +293,7 @@ def write_result(
     diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
     places: of the loads in space (torchrod.Analysis.places). base: where the robot stands in the lab. time: of the samples (s).
     intervals: intervals from draws of the posterior (estimation.intervals), which then stand in place of the normal ones.
+    parameters: the names of the robot's parameters that were unknown.
     Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
     """
     path = Path(path)
@@ -301,7 +307,7 @@ def write_result(
         return
     if path.suffix == ".json":
         seconds = None if time is None else time.tolist()
-        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, seconds, intervals)
+        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, seconds, intervals, parameters)
         put(path, lambda file: _stream(file, json.dumps(robot), texts))
         return
     said, which = np.unique([_message(estimate, diagnosis, b) for b in range(len(samples))], return_inverse=True)

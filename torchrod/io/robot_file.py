@@ -16,9 +16,10 @@ from ..mechanics.tendons import Tendon, Tendons
 from ..util.errors import InputError, shown
 from ..util.precision import DTYPE
 from .base_pose import BasePose, as_base_pose
+from .uncertainty import uncertainty_of
 from .values import as_number, as_numbers, as_rows, as_table, in_si, read_toml
 
-TOP_KEYS = {"name", "rod", "tendons", "base"}
+TOP_KEYS = {"name", "rod", "tendons", "base", "uncertainty"}
 KINDS = {"round": ("diameter", "inner_diameter"), "oval": ("axes", "angle"), "stiffness": ("K_se", "K_bt")}  # of a section
 MODULI = ("youngs_modulus", "shear_modulus")
 SECTION_KEYS = (*KINDS["round"], *KINDS["oval"], *KINDS["stiffness"], *MODULI)
@@ -325,6 +326,7 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
     if bool(gravity.any()) and rod.mass == 0:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
     base_pose_of(path, content)
+    uncertainty_of(path, content)
     name = content.get("name", path.stem)
     if not isinstance(name, str):
         raise InputError(f"{path}: name is {shown(name)}; it must be a text in quotes")

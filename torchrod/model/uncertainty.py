@@ -166,11 +166,9 @@ def _interpolated(s: Float[Tensor, " n"], at: Float[Tensor, " k"], values: Float
 
 def _with_rows(rod: Rod, places: list[float]) -> Float[Tensor, "rows 4"]:
     """The reference curvature with a row at each of the places, jumps kept."""
-    rows = rod.reference_curvature
-    new = [s for s in places if not bool((rows[:, 0] - s).abs().min() <= 1e-9 * rod.length)]
-    at = torch.tensor(new, dtype=DTYPE)
-    u = rod.curvature_at(at, at)
-    if len(rows) == 1:  # constant: its own place says nothing
-        return torch.cat([at.unsqueeze(-1), u], -1) if new else rows
-    every = torch.cat([rows, torch.cat([at.unsqueeze(-1), u], -1)])
-    return every[every[:, 0].argsort(stable=True)]
+    rows, every = rod.reference_curvature, torch.tensor(places, dtype=DTYPE)
+    if len(rows) == 1:  # the same everywhere, whatever place it stands at
+        return torch.cat([every.unsqueeze(-1), rows[:, 1:].expand(len(every), 3)], -1)
+    new = every[(rows[:, 0].unsqueeze(-1) - every).abs().amin(0) > 1e-9 * rod.length]
+    rows = torch.cat([rows, torch.cat([new.unsqueeze(-1), rod.curvature_at(new, new)], -1)])
+    return rows[rows[:, 0].argsort(stable=True)]

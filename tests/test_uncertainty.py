@@ -1,0 +1,208 @@
+"""What is only nearly known of a robot: the model of its errors, what it does to intervals, and [uncertainty] of ROBOT.toml."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.problems import posed, unknowns_of
+from tests.robots import T, busy_robot, steel_rod
+from torchrod import (
+    GaussianCoordinates,
+    Markers,
+    PointForces,
+    Problem,
+    Registration,
+    Robot,
+    Tendons,
+    Uncertainty,
+    Unknowns,
+    estimate,
+    solve_shape,
+)
+from torchrod.cli import main
+
+S = torch.linspace(0.02, 0.4, 20)
+EVERY = Uncertainty(0.03, 0.05, 0.04, 0.1, 0.1, 0.2, 0.1, 0.05)
+
+
+def problem_of(robot: Robot, uncertainty: Uncertainty, **unknown) -> Problem:
+    tension = T([[3.0, 2.0], [1.0, 0.5]])[:, : len(robot.tendons)] if len(robot.tendons) else None
+    positions = 0.1 * torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0))
+    return posed(T([0.1, 0.25, 0.4]), positions, 1e-3, robot, None, tension, steps=20, uncertainty=uncertainty, **unknown)
+
+
+@pytest.mark.parametrize("robot", [steel_rod, busy_robot])
+def test_jacobian(robot):
+    problem = problem_of(robot(), Uncertainty(stiffness=0.03, friction=0.1, set=0.1), registration=Registration())
+    x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0))
+    h, H = problem.linearized(x)
+    assert torch.allclose(h, problem.h(x, differentiable=False), rtol=0, atol=1e-12)
+    step = 1e-5 * torch.eye(problem.size)
+    for k in range(problem.size):
+        slope = (problem.h(x + step[k], differentiable=False) - problem.h(x - step[k], differentiable=False)) / 2e-5
+        assert torch.allclose(slope, H[..., k], rtol=1e-6, atol=1e-6)
+
+
+def test_the_parameters_are_those_that_a_robot_has():
+    passive, pulled = (tuple(p.name for p in EVERY.parameters(r())) for r in (steel_rod, busy_robot))
+    bumps = [f"curvature_{axis}_{k}" for axis in "xy" for k in range(1, 6)]
+    assert set(passive) == {"stiffness", "set_x", "set_y", *bumps}
+    assert set(pulled) - set(passive) == {"mass", "gravity_1", "gravity_2", "tension_1", "tension_2", "friction_1", "friction_2"}
+
+
+@pytest.mark.parametrize("name", ["stiffness", "mass", "tension_1", "friction_2", "gravity_1", "set_y", "curvature_x_2"])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_one_standard_deviation_is_a_robot_that_is_off_by_it(name, sign):
+    """h at theta = +-1 is h of the changed robot, by numbers written here."""
+    robot = busy_robot()
+    problem = problem_of(robot, EVERY)
+    names = [p.name for p in EVERY.parameters(robot)]
+    x = torch.zeros(2, problem.size)
+    generator = torch.Generator().manual_seed(1)
+    free = [i for i in range(problem.size) if not problem.state.parameters.at.start <= i < problem.state.parameters.at.stop]
+    x[:, free] = 0.3 * torch.randn(2, len(free), generator=generator)
+    plain = x[:, free]
+    x[:, problem.state.parameters.at.start + names.index(name)] = sign
+    rod, gravity, tendons, tension = robot.rod, robot.gravity, list(robot.tendons.tendons), problem.tension
+    options = [gravity]
+    assert tension is not None
+    if name == "stiffness":
+        rod = replace(rod, K_se=(1 + 0.03 * sign) * rod.K_se, K_bt=(1 + 0.03 * sign) * rod.K_bt)
+    elif name == "mass":
+        rod = replace(rod, mass_per_length=(1 + 0.05 * sign) * rod.mass_per_length)
+    elif name == "tension_1":
+        tension = tension * T([1 + 0.04 * sign, 1.0])
+    elif name == "friction_2":
+        tendons[1] = replace(tendons[1], friction=0.1 * sign)
+    elif name == "gravity_1":
+        turned = T([math.cos(0.05), 0.0, 0.0]) * 9.81
+        change = sign * math.sin(0.05) * 9.81
+        options = [turned + T([0.0, change, 0.0]), turned + T([0.0, 0.0, change])]
+        options += [turned - T([0.0, change, 0.0]), turned - T([0.0, 0.0, change])]
+    elif name == "set_y":
+        rod = replace(rod, reference_curvature=rod.reference_curvature + T([[0.0, 0.0, 0.1 * sign, 0.0]]))
+    else:
+        rows = torch.stack([torch.linspace(0, 0.4, 5), *torch.zeros(3, 5)], -1)
+        rows[1, 1] = 0.2 * sign
+        rod = replace(rod, reference_curvature=rows)
+    exact = problem.of(replace(problem.unknowns, uncertainty=None))
+
+    def off(gravity):
+        other = replace(exact, robot=replace(robot, rod=rod, gravity=gravity, tendons=Tendons(tuple(tendons))), tension=tension)
+        vars(other)["state"] = exact.state
+        return other.h(plain, False)
+
+    errors = [float((problem.h(x, False) - off(g)).abs().max()) for g in options]
+    assert min(errors) < 1e-6, "of grids with other nodes"
+    assert float((problem.h(x, False) - exact.h(plain, False)).abs().max()) > 1e-5
+
+
+def covered(robot: Robot, change, uncertainty: Uncertainty | None, tension=None, noise=1e-3, B=60) -> tuple[float, float]:
+    """Shares of 95 % intervals of force and place that hold, on samples each of a robot of its own."""
+    g, L = torch.Generator().manual_seed(11), robot.rod.length
+    size = robot.rod.force_scale * (0.5 + 0.5 * torch.rand(B, 1, generator=g))
+    turn, place = 2 * math.pi * torch.rand(B, 1, generator=g), L * (0.3 + 0.65 * torch.rand(B, 1, generator=g))
+    load = PointForces(torch.stack([size * turn.cos(), size * turn.sin(), 0 * size], -1), place)
+    readings = None if tension is None else tension * torch.rand(B, len(robot.tendons), generator=g)
+    shapes = []
+    for b in range(B):
+        own, pulled = change(robot, None if readings is None else readings[b : b + 1], g)
+        shapes.append(solve_shape(own, (load.take(torch.tensor([b])),), pulled, S, 1).p)
+    p = torch.cat(shapes)
+    p = p + noise * L * torch.randn(p.shape, generator=g)
+    unknowns = Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale), uncertainty=uncertainty)
+    fit = estimate(Problem(robot, unknowns, [Markers(S, p, noise * L)], readings))
+    assert int((fit.status == 0).sum()) >= B - 1
+    held = [
+        ((i[..., 0] <= t) & (t <= i[..., 1])).double().mean()
+        for i, t in ((fit.magnitude_interval, size), (fit.location_interval, place))
+    ]
+    return float(held[0]), float(held[1])
+
+
+def bent(robot, tension, g):
+    """A set of 0.2/m."""
+    rows = robot.rod.reference_curvature.clone()
+    rows[:, 1:3] += 0.2 * torch.randn(1, 2, generator=g)
+    return replace(robot, rod=replace(robot.rod, reference_curvature=rows)), tension
+
+
+def stiffer(robot, tension, g):
+    k = 1 + 0.1 * float(torch.randn(1, generator=g))
+    return replace(robot, rod=replace(robot.rod, K_se=k * robot.rod.K_se, K_bt=k * robot.rod.K_bt)), tension
+
+
+def rubbing(robot, tension, g):
+    mu = (0.15 * torch.randn(len(robot.tendons), generator=g)).tolist()
+    return replace(
+        robot, tendons=Tendons(tuple(replace(t, friction=m) for t, m in zip(robot.tendons.tendons, mu, strict=True)))
+    ), tension
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(
+    ("robot", "change", "stated", "tension"),
+    [
+        (steel_rod, bent, Uncertainty(set=0.2), None),
+        (steel_rod, stiffer, Uncertainty(stiffness=0.1), None),
+        (busy_robot, rubbing, Uncertainty(friction=0.15), 6.0),
+    ],
+)
+def test_intervals_hold_where_the_error_is_stated(robot, change, stated, tension):
+    force, place = covered(robot(), change, stated, tension)
+    assert min(force, place) > 0.87
+    exact = covered(robot(), change, None, tension)
+    assert min(exact) < 0.85, "taken as exact, one of the two does not"
+
+
+def test_from_the_file_to_the_result(tmp_path, capsys):
+    rod, (robot, s) = (
+        'name = "rod"\n[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n',
+        (steel_rod(), S),
+    )
+    p = solve_shape(robot, (PointForces(T([[[0.6, 0.1, 0.0]]]), T([[0.3]])),), None, s, 1).p[0]
+    (tmp_path / "s.csv").write_text("s,x,y,z\n" + "\n".join(",".join(map(str, row)) for row in np.column_stack([s, p]).tolist()))
+    spreads = []
+    for stated in ("", "[uncertainty]\nstiffness = 0.05\nset = 0.1\nframe = [0.001, 0.005]\n"):
+        (tmp_path / "r.toml").write_text(rod + stated)
+        out = str(tmp_path / "r.json")
+        assert main(["estimate", str(tmp_path / "r.toml"), str(tmp_path / "s.csv"), "--noise", "1e-3", "--out", out]) == 0
+        (record,) = json.loads((tmp_path / "r.json").read_text())["results"]
+        spreads.append(record["loads"][0]["std"]["magnitude_N"])
+    assert set(record["parameters"]) == {"stiffness", "set_x", "set_y"}
+    assert record["parameters"]["stiffness"]["std"] == pytest.approx(0.05, rel=1e-3), "a passive rod's push tells nothing of it"
+    assert "registration" in record
+    assert spreads[1] ** 2 > spreads[0] ** 2 + (0.04 * 0.6) ** 2
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("stiffness = -0.1", "stiffness is -0.1; it must be a finite standard deviation"),
+        ("stiffnes = 0.1", "stiffnes"),
+        ('mass = "x"', "uncertainty.mass"),
+        ("frame = [0.001]", "uncertainty.frame"),
+        ("frame = [0.001, 3.0]", "3 degrees are 0.052"),
+        ("curvature_length = 0", "curvature_length is 0"),
+    ],
+)
+def test_bad_input(text, said, tmp_path, capsys):
+    path = tmp_path / "r.toml"
+    path.write_text(
+        f"[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n[uncertainty]\n{text}\n"
+    )
+    (tmp_path / "s.csv").write_text("s,x,y,z\n0.2,0,0,0.2\n0.4,0,0,0.4\n")
+    assert main(["estimate", str(path), str(tmp_path / "s.csv")]) == 2
+    error = capsys.readouterr().err
+    assert said in error and str(path) in error and error.count("\n") == 1
+
+
+def test_a_learned_start_steps_aside_and_other_unknowns_stay():
+    problem = problem_of(busy_robot(), EVERY, tip="force", tension_std=0.2)
+    assert problem.state.free_size == 4 + 3
+    assert unknowns_of(steel_rod(), uncertainty=EVERY).uncertainty is EVERY
