@@ -267,7 +267,7 @@ def test_coverage(name):
     assert found.accepted > 0.97
     for _, over_bound, held in (found.force, found.place):
         assert 0.8 < over_bound < 1.2
-        assert 0.89 < held < 0.995
+        assert held > 0.87, "95 % less four standard errors of so many pushes"
 
 
 def test_arc_lengths_off_are_told_by_their_deviation_only():
