@@ -272,6 +272,8 @@ class Basins:
 
     def improve(self, problem: Problem, fit: Estimate, wanted: Bool[Tensor, " B"] | bool = True) -> Estimate:
         """A fit that is there already, looked for elsewhere where it is plainly wrong and that is wanted."""
+        if bool(fit.accepted.all()):
+            return fit
         elsewhere = getattr(problem.unknowns.loads, "elsewhere", None)  # a family of a user's own need not have it
         if not self.most or elsewhere is None or not len(gammas := elsewhere()):
             return fit
@@ -383,24 +385,26 @@ def estimate_each(
 
 def _followed(problem: Problem, fit: Estimate, settings: Settings) -> Estimate:
     """The fit, repeated with twice the steps as long as they move what is read; what even MOST_STEPS do not follow is said."""
+    bad = ~checks.follows(problem, fit.x, fit.status == int(Status.CONVERGED))
+    if not bool(bad.any()):
+        return fit
     solve = solver_of(replace(settings, restarts=(), basins=0))
-    part, at = problem, torch.arange(problem.batch)
-    while True:
-        converged = (fit.status[at] == int(Status.CONVERGED)).nonzero().squeeze(-1)
-        part, at = part.take(converged), at[converged]
-        bad = (~checks.follows(part, fit.x[at])).nonzero().squeeze(-1) if len(at) else converged
-        part, at = part.take(bad), at[bad]
-        if not len(at) or part.steps >= checks.MOST_STEPS:
-            break
+    at = bad.nonzero().squeeze(-1)
+    part = problem.take(at)
+    while len(at) and part.steps < checks.MOST_STEPS:
         part = part.with_steps(min(2 * part.steps, checks.MOST_STEPS))
         again = solve(part, Start.at(fit.x[at], Origin.OTHER_FIT))
         kept = {name: getattr(fit, name) for name in ("origin", "guess", "fate", "restarts")}
         fit = replace(fit.merged(again, at, torch.ones_like(at, dtype=torch.bool)), **kept)
+        rest = (~checks.follows(part, again.x, again.status == int(Status.CONVERGED))).nonzero().squeeze(-1)
+        part, at = part.take(rest), at[rest]
     return replace(fit, coarse=fit.coarse.index_fill(0, at, True), accepted=fit.accepted.index_fill(0, at, False))
 
 
 def _stable(problem: Problem, fit: Estimate) -> Estimate:
     """The fit, with a word on equilibria in which no rod stays."""
+    if problem.robot.weightless and not problem.state.tip.size:
+        return fit
     index = (fit.status == int(Status.CONVERGED)).nonzero().squeeze(-1)
     falls = index[~checks.stable(problem.take(index), fit.x[index])] if len(index) else index
     pushed = problem.state.external.stop > 0  # a contact is no dead load: it may hold the rod as well
