@@ -15,9 +15,12 @@ from torchrod import (
     BaseWrench,
     GaussianCoordinates,
     Markers,
+    PointForces,
     PointWrenches,
     Poses,
     Problem,
+    Robot,
+    Rod,
     Shapes,
     Unknowns,
     estimate,
@@ -27,7 +30,7 @@ from torchrod import (
 )
 from torchrod.cli import main
 from torchrod.io import KINDS
-from torchrod.mechanics.lie import exponential, product
+from torchrod.mechanics.lie import conjugate, exponential, product
 from torchrod.util.errors import InputError
 
 ROD = (Path(__file__).resolve().parents[1] / "docs" / "example" / "rod.toml").read_text()
@@ -165,3 +168,24 @@ def test_a_stated_noise_weighs_its_row(tmp_path):
         assert record["accepted"]
         found.append([record["loads"][0]["location_m"], *record["loads"][0]["force_local_N"], record["chi2"]])
     assert found[0] == pytest.approx(found[1], rel=1e-4)
+
+
+def test_curvatures_alone_from_the_file_to_the_figure(tmp_path, capsys):
+    """Gratings every 20 mm of a rod under one push: the load is found, and drawn again from the result."""
+    rod = Rod.circular(0.4, 0.0014, 207e9, 79e9)
+    s = torch.linspace(0.02, 0.38, 19, dtype=torch.float64)
+    push = PointForces(torch.tensor([[[0.5, 0.2, 0.0]]], dtype=torch.float64), torch.tensor([[0.3]], dtype=torch.float64))
+    q = solve_shape(Robot(rod), (push,), None, torch.cat([s - 1e-3, s + 1e-3]).sort().values, 1).q[0]
+    turn = 2 * product(conjugate(q[::2]), q[1::2])[:, :2] / 2e-3
+    rows = [f"{a},{x},{y}" for a, (x, y) in zip(s.tolist(), turn.tolist(), strict=True)]
+    (tmp_path / "s.csv").write_text("s,kx,ky\n" + "\n".join(rows) + "\n")
+    (tmp_path / "r.toml").write_text("[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n")
+    paths = [str(tmp_path / name) for name in ("r.toml", "s.csv", "r.json")]
+    assert main(["estimate", *paths[:2], "--curvature-noise", "0.02", "--out", paths[2]]) == 0
+    (load,) = json.loads((tmp_path / "r.json").read_text())["results"][0]["loads"]
+    assert abs(load["magnitude_N"] - 0.29**0.5) < 3 * load["std"]["magnitude_N"]
+    assert abs(load["location_m"] - 0.3) < 3 * load["std"]["location_m"]
+    assert main(["plot", *paths, "--out", str(tmp_path / "f.png")]) == 0
+    assert (tmp_path / "f.png").stat().st_size > 1000
+    assert main(["estimate", *paths[:2]]) == 2
+    assert "--curvature-noise" in capsys.readouterr().err

@@ -189,6 +189,7 @@ def test_from_the_file_to_the_result(tmp_path, capsys):
         ("frame = [0.001]", "uncertainty.frame"),
         ("frame = [0.001, 3.0]", "3 degrees are 0.052"),
         ("curvature_length = 0", "curvature_length is 0"),
+        ("stiffness = 3", "stiffness is 3.0; it is a share"),
     ],
 )
 def test_bad_input(text, said, tmp_path, capsys):
@@ -203,6 +204,8 @@ def test_bad_input(text, said, tmp_path, capsys):
 
 
 def test_a_learned_start_steps_aside_and_other_unknowns_stay():
-    problem = problem_of(busy_robot(), EVERY, tip="force", tension_std=0.2)
+    problem = problem_of(busy_robot(), EVERY, tip="force")
     assert problem.state.free_size == 4 + 3
     assert unknowns_of(steel_rod(), uncertainty=EVERY).uncertainty is EVERY
+    with pytest.raises(ValueError, match="do not go together"):
+        unknowns_of(busy_robot(), uncertainty=EVERY, tension_std=0.2)

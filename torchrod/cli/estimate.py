@@ -70,7 +70,6 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
     nearly = read_uncertainty(options.robot)
     registration = _registration(options) or nearly.frame
-    unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.robot)
     stated = STATED * rod.length if noise is None else noise
     positive("--angle-noise", options.angle_noise)
     for value in options.base_noise or ():
@@ -80,6 +79,7 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
         positive("--curvature-noise", options.curvature_noise)
     noises = Noises(stated, options.angle_noise, base, options.curvature_noise)
     try:
+        unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.robot)
         return Problem(robot, unknowns, shapes.sensors(noises), shapes.tension, options.steps or 0)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None

@@ -55,7 +55,7 @@ class Shapes(Float64):
         """How many groups of rows the sensors have together, as Problem.group_count."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return sum(int(sensor.groups.max()) + 1 for sensor in self.sensors(Noises(1.0, 1.0, (1.0, 1.0))))
+            return sum(int(sensor.groups.max()) + 1 for sensor in self.sensors(Noises(1.0, 1.0, (1.0, 1.0), 1.0)))
 
     def sensors(self, noise: "Noises") -> list[Sensor]:
         """Everything that was measured, by the sensors that take it. Errors: ValueError where a noise is needed and not stated."""

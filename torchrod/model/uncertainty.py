@@ -22,6 +22,7 @@ from ..mechanics.rod import Rod
 from ..mechanics.tendons import Tendons
 from ..util.precision import DTYPE
 
+MOST_SHARE = 0.5  # of a number whose error is relative: with more, one standard deviation leaves next to nothing of it
 KNOTS = 10  # pieces of the length over which an error of the curvature is one, where no length is stated
 Tension = Float[Tensor, "B T"] | None
 Change = Callable[[Robot, Tension, float], tuple[Robot, Tension]]
@@ -62,6 +63,9 @@ class Uncertainty:
             least = value is not None and (value > 0 if field.name == "curvature_length" else value >= 0)
             if value is not None and not (least and value < math.inf):
                 raise ValueError(f"Uncertainty.{field.name} is {value}; it must be a finite standard deviation, at least 0")
+        for name in ("stiffness", "mass", "tension"):
+            if (share := getattr(self, name)) > MOST_SHARE:
+                raise ValueError(f"Uncertainty.{name} is {share}; it is a share, 0.05 for 5 %, and may be at most {MOST_SHARE}")
 
     def prepared(self, robot: Robot) -> Robot:
         """The robot with rows of its reference curvature where `curvature` bends it, so that robots compared have one grid."""

@@ -164,6 +164,10 @@ class Unknowns:
             raise ValueError(f"Unknowns.tip is {self.tip!r}; it must be one of {', '.join(TIP_SIZE)}")
         if self.tension_std is not None and not 0 < self.tension_std < float("inf"):
             raise ValueError(f"Unknowns.tension_std is {self.tension_std} N; it must be positive and finite, or None")
+        if self.tension_std is not None and self.uncertainty is not None:
+            raise ValueError(
+                "tension_std (--tension-std) and an uncertainty do not go together; state the tension's there, as a share"
+            )
 
     def state(self, robot: Robot) -> State:
         """The blocks of x for a robot."""
