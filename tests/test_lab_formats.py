@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.robots import T, steel_rod
-from torchrod import PointForces, read_shapes, solve_shape
+from torchrod import PointForces, Shapes, read_shapes, solve_shape
 from torchrod.cli import main
+from torchrod.cli.lab_import import _warn_of_distance
 from torchrod.cli.parser import IMPORTED
-from torchrod.io.lab_formats import FORMATS
+from torchrod.io.lab_formats import FORMATS, Imported
 
 ROOT = Path(__file__).resolve().parents[1]
 ROD = (ROOT / "docs" / "example" / "rod.toml").read_text()
@@ -379,3 +380,15 @@ def test_real_files(tmp_path, file):
     frames = {row[0] for row in rows[1:]}
     lines = len((REAL / file).read_bytes().splitlines()) if form != "c3d" else 580
     assert len(frames) in range(lines - 7, lines + 1) or form == "c3d"
+
+
+def test_positions_of_another_frame_are_told(recwarn):
+    """A rod that stands 0.7 m beside the origin; noise, stretch and a missing marker are no such thing."""
+    s = torch.linspace(0.02, 0.4, 20)
+    p = solve_shape(steel_rod(), (PointForces(T([[[0.6, 0.1, 0.0]]]), T([[0.3]])),), None, s, 1).p
+    p[0, 3] = torch.nan
+    near = p * 1.02 + 5e-3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
+    _warn_of_distance("a.csv", Imported(Shapes(s, near, ["0"]), None, None))
+    assert not len(recwarn)
+    with pytest.warns(UserWarning, match=r"a.csv: 19 of 20 places are farther from the base than the rod reaches"):
+        _warn_of_distance("a.csv", Imported(Shapes(s, p + T([0.7, 0.0, 0.0]), ["0"]), None, None))

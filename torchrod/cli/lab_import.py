@@ -11,6 +11,8 @@ from ..io.lab_formats import Imported, convert, read_layout, read_recording
 from ..util.errors import InputError
 from .arguments import writable
 
+FAR, FAR_FROM_BASE = 1.1, 0.05  # times the arc length, and of the longest one, that noise and stretch account for
+
 
 def lab_import(options: Namespace) -> None:
     """torchrod import."""
@@ -28,8 +30,20 @@ def lab_import(options: Namespace) -> None:
         raise InputError(f"{options.file}: {error}") from None
     if not len(found.shapes.samples):
         raise InputError(f"{options.file}: holds no frames; export it again")
+    _warn_of_distance(options.file, found)
     write_shapes(options.out, found.shapes)
     print(_report(options.out, found))  # noqa: T201
+
+
+def _warn_of_distance(file: str, found: Imported) -> None:
+    """No place of a rod is farther from its base than the rod is long up to there: such positions are not in the base frame."""
+    shapes = found.shapes
+    reach = shapes.s if shapes.offsets is None else shapes.s + shapes.offsets.norm(dim=-1)
+    far = shapes.positions.norm(dim=-1) > FAR * reach + FAR_FROM_BASE * float(shapes.s.max())
+    if 2 * int(far.sum()) > int(torch.isfinite(shapes.positions).all(-1).sum()):
+        remedy = "state the base frame, [base] in the layout or in ROBOT.toml, and check units and arc lengths"
+        said = f"{file}: {int(far.sum())} of {far.numel()} places are farther from the base than the rod reaches; {remedy}"
+        warnings.warn(said, stacklevel=2)
 
 
 def _report(out: str, found: Imported) -> str:
