@@ -102,6 +102,8 @@ def _lines(result: Estimate, samples: list[str], noise: Noise | None) -> list[st
 
 
 def _rms(millimetres: float) -> str:
+    if math.isnan(millimetres):  # of what has no position
+        return "-"
     return f"{millimetres:.2g}" if 0 < millimetres < 1e-3 else f"{millimetres:.3f}"
 
 
