@@ -90,7 +90,7 @@ def _estimate_parser() -> ArgumentParser:
         type=str,
         choices=["sampled", "gaussian"],
         default="gaussian",
-        help="intervals (95 of 100) in RESULT: from the covariance, or from draws of the posterior, about 10 ms of CPU a shape",
+        help="what the 95-percent intervals in RESULT come from: the covariance, or draws of the posterior (10 ms a shape or more)",
     )
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
     about = "whether RESULT has the load profiles and their bands; auto: up to 1,000 samples"
