@@ -144,6 +144,7 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)  # before the work that would be lost
     say: Callable[[str], None] = print
     lines = list(HEAD)
     for name in options.kinds:

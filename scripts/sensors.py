@@ -17,6 +17,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=500, help="pushes per row")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)  # before the work that would be lost
     torch.set_default_dtype(torch.float64)
     lines = [
         "# What every sensor tells",
