@@ -24,6 +24,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
+from torchrod.estimation.evaluator import NearlyKnownEvaluator, TorchEvaluator, evaluator
 
 S = torch.linspace(0.02, 0.4, 20)
 EVERY = Uncertainty(0.03, 0.05, 0.04, 0.1, 0.1, 0.2, 0.1, 0.05)
@@ -209,3 +210,18 @@ def test_a_learned_start_steps_aside_and_other_unknowns_stay():
     assert unknowns_of(steel_rod(), uncertainty=EVERY).uncertainty is EVERY
     with pytest.raises(ValueError, match="do not go together"):
         unknowns_of(busy_robot(), uncertainty=EVERY, tension_std=0.2)
+
+
+@pytest.mark.parametrize("robot", [steel_rod, busy_robot])
+@pytest.mark.parametrize("nu", [math.inf, 5.0])
+def test_the_kernel_on_every_robot_nearby_is_the_torch_model(robot, nu):
+    problem = problem_of(robot(), EVERY, registration=Registration())
+    x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0))
+    fast, slow = evaluator(problem, nu), TorchEvaluator(problem, nu)
+    assert isinstance(fast, NearlyKnownEvaluator)
+    assert torch.allclose(fast.cost(x), slow.cost(x), rtol=1e-9)
+    one = torch.tensor([1])
+    for a, b in ((fast.sums(x), slow.sums(x)), (fast.take(one).sums(x[one]), slow.take(one).sums(x[one]))):
+        for name in ("A", "g", "cost", "C", "r", "line"):
+            ours, theirs = getattr(a, name), getattr(b, name)
+            assert torch.allclose(ours, theirs, rtol=1e-9, atol=1e-9 * float(theirs.abs().max())), name

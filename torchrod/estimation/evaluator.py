@@ -23,6 +23,7 @@ from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
 from ..model.problem import TIP_ROWS, Problem
+from ..model.uncertainty import parabola
 from ..util.by_value import Kept, key
 from . import filter as ekf
 
@@ -94,8 +95,16 @@ def evaluator(problem: Problem, nu: float = math.inf) -> Evaluator:
     """The evaluator that serves a problem, which keeps it."""
     kept = vars(problem).setdefault("_evaluators", {})
     if nu not in kept:
-        kept[nu] = KernelEvaluator(problem, nu) if kernel_serves(problem) else TorchEvaluator(problem, nu)
+        kept[nu] = _made(problem, nu)
     return kept[nu]
+
+
+def _made(problem: Problem, nu: float) -> Evaluator:
+    if kernel_serves(problem):
+        return KernelEvaluator(problem, nu)
+    if problem.state.parameters.size and kernel_serves(problem.exact):
+        return NearlyKnownEvaluator(problem, nu)
+    return TorchEvaluator(problem, nu)
 
 
 def kernel_serves(problem: Problem) -> bool:
@@ -141,21 +150,33 @@ class TorchEvaluator:
         """r = z - h(x), zero where nothing was read."""
         return torch.where(self.problem.weights > 0, self.problem.reading - h, 0.0)
 
+    def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
+        """See Problem."""
+        return self.problem.h(x, differentiable=False)
+
+    def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """See Problem."""
+        return self.problem.linearized(x)
+
     def cost(self, x: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
         """See Evaluator."""
         problem, m = self.problem, len(self.problem.groups)
-        square = problem.weights * self.residual(problem.h(x, differentiable=False)) ** 2
+        square = problem.weights * self.residual(self.h(x)) ** 2
         sensors, _ = ekf.sensors_cost(square[:, :m], problem.groups, self.nu)
         return sensors + square[:, m:].sum(-1) + (problem.precision * (problem.mean - x) ** 2).sum(-1)
 
     def sums(self, x: Float[Tensor, "B n"]) -> kernel.Sums:
         """See Evaluator."""
         problem = self.problem
-        h, H = problem.linearized(x)
+        h, H = self.linearized(x)
         r = self.residual(h)
         N = ekf.normal_equations(H, r, problem.weights, problem.groups, self.nu)
         C = H[:, len(problem.groups) :].contiguous()
-        return kernel.Sums(N.A, N.g, N.cost, C, r, problem.shape(x, differentiable=False).p)
+        return kernel.Sums(N.A, N.g, N.cost, C, r, self.line(x))
+
+    def line(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B P 3"]:
+        """The centre line (m, the rod's own frame)."""
+        return self.problem.shape(x, differentiable=False).p
 
     def posterior(self, sums: kernel.Sums, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n n"], Float[Tensor, " B"]]:
         """See Evaluator."""
@@ -221,6 +242,18 @@ class KernelEvaluator:
         """See Evaluator."""
         return kernel.posterior_now(sums, x, self.problem.mean, self.problem.precision, self.problem.exact_tip)
 
+    def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
+        """See Problem."""
+        t = self.tables(x)
+        return kernel.measured_now(x, t.structure, t.markers, slopes=False)[0]
+
+    def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """See Problem."""
+        t = self.tables(x)
+        h, H = kernel.measured_now(x, t.structure, t.markers, slopes=True)
+        assert H is not None
+        return h, H
+
     def balance(
         self, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float
     ) -> tuple[Float[Tensor, "B 6"], Float[Tensor, " B"], Float[Tensor, "B P 3"]]:
@@ -246,6 +279,40 @@ class KernelEvaluator:
             return None
         calls = [(e._compiled(run, own), e.tables(run.at.x)) for e, own in zip((self, fine), limits, strict=True)]
         return kernel.iterate_all(calls[0], calls[1], live, run.near, most)
+
+
+@dataclass(frozen=True)
+class NearlyKnownEvaluator(TorchEvaluator):
+    """A robot with parameters that are only nearly known, by the kernel for each of the robots near it (model.uncertainty)."""
+
+    @cached_property
+    def _exact(self) -> KernelEvaluator:
+        return KernelEvaluator(self.problem.exact, self.nu)
+
+    @cached_property
+    def _off(self) -> list[KernelEvaluator]:
+        return [KernelEvaluator(other, self.nu) for other in self.problem.off]
+
+    def take(self, index: Int[Tensor, " b"]) -> "NearlyKnownEvaluator":
+        """The samples of an index."""
+        part = NearlyKnownEvaluator(self.problem.take(index), self.nu)
+        vars(part)["_exact"], vars(part)["_off"] = self._exact.take(index), [other.take(index) for other in self._off]
+        return part
+
+    def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
+        """See Problem."""
+        plain, theta = self.problem.without_parameters(x)
+        return parabola(self._exact.h(plain), torch.stack([other.h(plain) for other in self._off], -1), theta)[0]
+
+    def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """See Problem."""
+        plain, theta = self.problem.without_parameters(x)
+        return self.problem.with_parameters(self._exact.linearized(plain), [other.linearized(plain) for other in self._off], theta)
+
+    def line(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B P 3"]:
+        """The centre line (m) of the robot as the file has it."""
+        plain, _ = self.problem.without_parameters(x)
+        return self._exact.sums(plain).line
 
 
 # The kernel's tables.

@@ -126,6 +126,7 @@ CONSTANTS = {"MOST_TENDONS": MOST_TENDONS, "OUT": OUT} | FAMILIES
 FUNCTIONS: dict[str, tuple[type, ...]] = {
     "torchrod_march": (_P, _I),
     "torchrod_normal": (_P, _P, _I, _P, _I),
+    "torchrod_measure": (_P, _P, _I, _P, _P, _I),
     "torchrod_posterior": (_P, _P, _P, _P, _I, _I, _I, _I, _P, _P, _I),
     "torchrod_iterate": (_P, _P, _P, _P, _I, _I),
     "torchrod_filter": (_P, _P, _I, _I),
@@ -380,6 +381,16 @@ def normal_equations_now(x: Float[Tensor, "B n"], task: CTask, P: int) -> Sums:
     found = Sums.room(B, n, 3 * P + 6, P)
     _run("torchrod_normal", B, ctypes.byref(task), _pointer(x, "x"), B, ctypes.byref(found.structure))
     return found
+
+
+def measured_now(
+    x: Float[Tensor, "B n"], task: CTask, P: int, slopes: bool
+) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"] | None]:
+    """h(x) and, where slopes are wanted, dh/dx."""
+    (B, n), x = x.shape, x.contiguous()
+    h, H = x.new_empty(B, 3 * P + 6), x.new_empty(B, 3 * P + 6, n) if slopes else None
+    _run("torchrod_measure", B, ctypes.byref(task), _pointer(x, "x"), B, _pointer(h, "h"), _pointer(H, "H"))
+    return h, H
 
 
 def cost_now(x: Float[Tensor, "B n"], mean: Prior, precision: Prior, task: CTask) -> Float[Tensor, " B"]:

@@ -75,6 +75,20 @@ void torchrod_normal(const Task* f, const double* x, int64_t count, const Sums* 
     });
 }
 
+// h (b, Z) of samples at x (b, n), and with H not null dh/dx (b, Z, n).
+void torchrod_measure(const Task* f, const double* x, int64_t count, double* h, double* H, int64_t threads) {
+    const int64_t n = f->size, Z = 3 * (f->known.outputs - 1) + PLAIN;
+    in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
+        const Measured m = measure(*f, lanes, [&](int64_t j) { return fetch({x, n}, lanes, j); }, H != nullptr, room);
+        for (int64_t l = 0; l < lanes.count; l++)
+            for (int64_t z = 0; z < Z; z++) {
+                const int64_t to = lanes.sample[l] * Z + z;
+                h[to] = m.h(z)[l];
+                for (int64_t j = 0; H && j < n; j++) H[to * n + j] = m.H(z)[j][l];
+            }
+    });
+}
+
 // From sums at x (b, n), with residuals of `rows` numbers: `Normal.posterior` of estimation/filter.py, covariance (b, n, n) and cost (b).
 // mean and precision: of the prior, (n) or a row per sample.
 void torchrod_posterior(const Sums* sums, const double* x, const Table* mean, const Table* precision, int64_t n, int64_t rows, int64_t exact,
@@ -184,7 +198,7 @@ int64_t torchrod_lanes() { return W; }
 
 // layout.h, and what each function takes. bindings.py compares the text with its own.
 const char* torchrod_layout() {
-    static const std::string text = structures_and_constants() + FUNCTION(torchrod_march) + FUNCTION(torchrod_normal) +
+    static const std::string text = structures_and_constants() + FUNCTION(torchrod_march) + FUNCTION(torchrod_normal) + FUNCTION(torchrod_measure) +
                                     FUNCTION(torchrod_posterior) + FUNCTION(torchrod_iterate) + FUNCTION(torchrod_filter) +
                                     FUNCTION(torchrod_balance) + FUNCTION(torchrod_perceptron) + FUNCTION(torchrod_cost);
     return text.c_str();

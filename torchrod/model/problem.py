@@ -26,6 +26,7 @@ from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_f
 from ..util.by_value import Kept, key
 from ..util.precision import DTYPE, Float64
 from .sensors import Markers, RodState, Sensor, TipWrench
+from .uncertainty import parabola
 from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
@@ -224,7 +225,9 @@ class Problem(Float64):
         prior = self.prior
         if prior is not None:
             prior = prior[0][index] if prior[0].ndim > 1 else prior[0], prior[1][index] if prior[1].ndim > 1 else prior[1]
-        return replace(self, sensors=[sensor.take(index) for sensor in self.sensors], tension=tension, prior=prior)
+        part = replace(self, sensors=[sensor.take(index) for sensor in self.sensors], tension=tension, prior=prior)
+        vars(part)["state"] = self.state  # which for a robot of `off` has the units of the exact one
+        return part
 
     def without(self, groups: Bool[Tensor, "B G"]) -> "Problem":
         """The same with the rows of these groups (Problem.groups) not read."""
@@ -283,8 +286,10 @@ class Problem(Float64):
         return self.tension if self.tension is None or not tension.size else self.tension + tension.of(x)
 
     def shape(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Shape:
-        """The rod at the sensors' arc lengths, in its own base frame."""
+        """The rod at the sensors' arc lengths, in its own base frame; what is only nearly known of it as the robot's file has it."""
         state = self.state
+        if state.parameters.size:
+            return self.exact.shape(self.without_parameters(x)[0], differentiable)
         loads = self.unknowns.loads.loads(x[..., state.loads.at])
         return shape_from_base(self.robot, loads, state.base.of(x), self.pulling(x), self.s, self.steps, differentiable)
 
@@ -292,23 +297,23 @@ class Problem(Float64):
         """[rows of every sensor, c (N, N m)]: what the sensors would read, in their units, then the tip residual."""
         if not self.state.parameters.size:
             return self._read(self.shape(x, differentiable), x)
-        plain, theta = self._without_parameters(x)
-        h = self._exact.h(plain, differentiable)
-        return _parabola(h, torch.stack([other.h(plain, differentiable) for other in self._off], -1), theta)[0]
+        plain, theta = self.without_parameters(x)
+        h = self.exact.h(plain, differentiable)
+        return parabola(h, torch.stack([other.h(plain, differentiable) for other in self.off], -1), theta)[0]
 
     # The robot's parameters: model.uncertainty.
 
     @cached_property
-    def _exact(self) -> "Problem":
+    def exact(self) -> "Problem":
         """The same with a robot that is known."""
         assert self.unknowns.uncertainty is not None
         unknowns = replace(self.unknowns, uncertainty=None)
         return replace(self, robot=self.unknowns.uncertainty.prepared(self.robot), unknowns=unknowns, prior=None)
 
     @cached_property
-    def _off(self) -> list["Problem"]:
+    def off(self) -> list["Problem"]:
         """With every parameter off by a standard deviation, upwards and downwards, in turn; x in the units of the exact one."""
-        exact, found = self._exact, []
+        exact, found = self.exact, []
         assert self.unknowns.uncertainty is not None
         for parameter in self.unknowns.uncertainty.parameters(self.robot):
             for error in (parameter.std, -parameter.std):
@@ -318,10 +323,22 @@ class Problem(Float64):
                 found.append(other)
         return found
 
-    def _without_parameters(self, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... m"], Float[Tensor, "... k"]]:
+    def without_parameters(self, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... m"], Float[Tensor, "... k"]]:
         """x without the parameters, and these, in standard deviations."""
         at = self.state.parameters.at
         return torch.cat([x[..., : at.start], x[..., at.stop :]], -1), x[..., at]
+
+    def with_parameters(
+        self,
+        at_zero: tuple[Float[Tensor, "B z"], Float[Tensor, "B z m"]],
+        off: list[tuple[Float[Tensor, "B z"], Float[Tensor, "B z m"]]],
+        theta: Float[Tensor, "B k"],
+    ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """h and H from those of `exact` and of every `off` at x without the parameters."""
+        (h, H), at = at_zero, self.state.parameters.at.start
+        h, slopes = parabola(h, torch.stack([one for one, _ in off], -1), theta)
+        H, _ = parabola(H, torch.stack([one for _, one in off], -1), theta.unsqueeze(-2))
+        return h, torch.cat([H[..., :at], slopes, H[..., at:]], -1)
 
     def _read(self, shape: Shape, x: Float[Tensor, "... n"]) -> Float[Tensor, "... z"]:
         """What the sensors read of a shape."""
@@ -362,12 +379,8 @@ class Problem(Float64):
         """
         state, family = self.state, self.unknowns.loads
         if state.parameters.size:
-            plain, theta = self._without_parameters(x)
-            (h, H), at = self._exact.linearized(plain), state.parameters.at.start
-            off_h, off_H = (torch.stack(part, -1) for part in zip(*(other.linearized(plain) for other in self._off), strict=True))
-            h, slopes = _parabola(h, off_h, theta)
-            H, _ = _parabola(H, off_H, theta.unsqueeze(-2))
-            return h, torch.cat([H[..., :at], slopes, H[..., at:]], -1)
+            plain, theta = self.without_parameters(x)
+            return self.with_parameters(self.exact.linearized(plain), [other.linearized(plain) for other in self.off], theta)
         gamma, alpha = x[..., state.loads.at], state.base.of(x)
         grid = grid_for(self.robot, family.loads(gamma), self.s, self.steps)
         if grid.nodes.ndim > 1 or state.tension.size:
@@ -418,12 +431,3 @@ class Problem(Float64):
         axes = vmap(column, out_dims=(None, 0))  # pyright: ignore[reportArgumentType]
         h, columns = axes(d_states, d_beyond, torch.eye(n, dtype=x.dtype))
         return h, columns.movedim(0, -1)
-
-
-def _parabola(
-    at_zero: Float[Tensor, "... z"], off: Float[Tensor, "... z k2"], theta: Float[Tensor, "... k"]
-) -> tuple[Float[Tensor, "... z"], Float[Tensor, "... z k"]]:
-    """(1) of model.uncertainty, and its derivative by theta, from the values at zero and one standard deviation to either side."""
-    up, down, theta = off[..., ::2], off[..., 1::2], theta.unsqueeze(-2)
-    slope, curve = 0.5 * (up - down), 0.5 * (up + down) - at_zero.unsqueeze(-1)
-    return at_zero + (theta * slope + theta**2 * curve).sum(-1), slope + 2 * theta * curve

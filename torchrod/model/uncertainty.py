@@ -176,3 +176,12 @@ def _with_rows(rod: Rod, places: list[float]) -> Float[Tensor, "rows 4"]:
     new = every[(rows[:, 0].unsqueeze(-1) - every).abs().amin(0) > 1e-9 * rod.length]
     rows = torch.cat([rows, torch.cat([new.unsqueeze(-1), rod.curvature_at(new, new)], -1)])
     return rows[rows[:, 0].argsort(stable=True)]
+
+
+def parabola(
+    at_zero: Float[Tensor, "... z"], off: Float[Tensor, "... z k2"], theta: Float[Tensor, "... k"]
+) -> tuple[Float[Tensor, "... z"], Float[Tensor, "... z k"]]:
+    """(1), and its derivative by theta, from the values at zero and at one standard deviation to either side, in turn."""
+    up, down, theta = off[..., ::2], off[..., 1::2], theta.unsqueeze(-2)
+    slope, curve = 0.5 * (up - down), 0.5 * (up + down) - at_zero.unsqueeze(-1)
+    return at_zero + (theta * slope + theta**2 * curve).sum(-1), slope + 2 * theta * curve
