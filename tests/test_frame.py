@@ -41,7 +41,7 @@ def test_many_shapes_tell_the_frame():
     assert (frame.zeta[3:] - TURN).norm() < math.radians(0.7)
     corrected = frame.corrected(apart).of(known)
     plain = estimate(corrected)
-    fit = widened(corrected, [(known, everyone)], Registration(), frame, plain)
+    fit = widened(apart, [(known, everyone)], Registration(), frame, plain)
     best = estimate(problem_of(study, perfect))
     for what in ("location", "magnitude"):
         truth = study.location if what == "location" else study.force.norm(dim=-1)
@@ -64,7 +64,7 @@ def test_the_share_of_the_frame_is_that_of_a_joint_covariance():
     each = estimate(apart)
     frame = common_frame(apart, [(apart.unknowns, first)], each)
     corrected = frame.corrected(apart).of(known)
-    fit = widened(corrected, [(known, first)], Registration(), frame, estimate(corrected))
+    fit = widened(apart, [(known, first)], Registration(), frame, estimate(corrected))
     assert each.registration is not None
     assert torch.allclose(frame.zeta, each.registration[0], atol=2e-3)
     assert torch.allclose(fit.location_std, each.location_std, rtol=0.15)

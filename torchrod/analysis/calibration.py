@@ -1,61 +1,108 @@
-"""Calibration: mass per length, stiffness and load-cell offsets from unloaded shapes, by the estimator's own filter.
+"""Calibration: what a robot's file does not say well enough, from shapes of it under known loads, by the estimator's filter.
 
-The paper (section III.C) weighs its robot this way. The state is theta of analysis.unloaded_shapes, shared by all samples, with the
-markers of all of them stacked into one measurement; the recursion is estimation.filter's `advance`, with the estimator's step
-limit, adaptive noise and test of convergence.
+The parameters are those of model.uncertainty and the base frame's error, shared by all samples; what is each sample's own (errors
+from trial to trial, and loads, where they are not known) is eliminated (estimation.joint). The paper (section III.C) weighs its
+robot this way. What is a positive number is sought by its logarithm:
+
+    (1)  rho = rho_0 exp(z),   k = exp(z) of K_se and K_bt alike,   and others  value = value_0 + z
+
+Without tension and without a known load only rho / k shows.
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import chdtri
 from torch import Tensor
 
-from ..estimation import filter as ekf
+from ..estimation.joint import Joint, Shared, fit_jointly
 from ..estimation.result import ACCEPT, Z95
+from ..estimation.shared import BaseFrame, shared_frame
 from ..estimation.solve import Settings
 from ..mechanics.robot import Robot
 from ..mechanics.statics import steps_of_rod
-from ..mechanics.tendons import Tendons
-from ..model.load_families import GaussianCoordinates
+from ..model.load_families import GaussianCoordinates, LoadFamily
 from ..model.problem import Problem
-from ..model.sensors import Markers
-from ..model.unknowns import Unknowns
+from ..model.sensors import Markers, Sensor
+from ..model.uncertainty import KINDS, OF_TENDONS, Found, Parameter, Uncertainty
+from ..model.unknowns import Registration, Unknowns
 from ..util.precision import DTYPE
 from ..util.status import Status
-from .unloaded_shapes import MASS, OFFSET, PRIOR, STIFFNESS, Trial, UnloadedShapes
 
-RETREATS = 5  # halvings of a step that loses samples, before they are given up
-HARDLY = 0.5  # a standard deviation of theta above this determines nothing
+INNER = 100  # iterations of each fit; the settings' own count is of the steps of the parameters
+FREE = 10.0  # standard deviation of what is free, in sizes: it only keeps what does not show finite
+FIRST_SAG = 0.05  # where the file has no mass: the tip of the straight rod, held across gravity, sags by this part of its length
+HARDLY = 0.5  # a standard deviation above this part of a parameter's size determines nothing
+ALIKE = 0.95  # parameters so correlated cannot be told apart
+MASS, STIFFNESS, OFFSET, FRAME = "mass_per_length", "stiffness_factor", "tension_offset_", "frame_"
+PUBLIC = {"mass": MASS, "stiffness": STIFFNESS}  # names of a calibration for those of model.uncertainty
+FRAME_AXES = ("x", "y", "z", "turn_x", "turn_y", "turn_z")
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What is sought: a parameter of the robot, or (None) an entry of the base frame's error; and how it is written down.
+
+    name, unit: of the value. before: its value so far. size, std: see SharedParameter. logarithmic: (1).
+    """
+
+    name: str
+    unit: str
+    before: float
+    size: float
+    std: float
+    logarithmic: bool = False
+    parameter: Parameter | None = None
+
+    @property
+    def free(self) -> bool:
+        """Whether nothing is known of it."""
+        return self.std >= FREE * self.size
+
+    def error(self, z: float) -> float:
+        """Of the robot's parameter, in its unit."""
+        return math.expm1(z) if self.logarithmic else z
+
+    def value(self, z: Tensor) -> Tensor:
+        """In its unit."""
+        return self.before * z.exp() if self.logarithmic else self.before + z
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was calibrated. One entry per unknown: names, values before and after, standard deviations.
+    """What was calibrated. One entry per unknown: names, units, values before and after, standard deviations.
 
-    names: mass_per_length (kg/m), stiffness_factor (of K_se and K_bt alike, hence of E and G), tension_offset_1.. (N).
-    std_noise: from (H^T W H + P)^-1 with the stated noise; std: the same with the noise the residuals show, where chi2 / dof says
-    that it is larger (`rescaled`); std is what is reported, and interval_95 (n, 2), multiplicative for mass and stiffness, follows
-    it. NaN where the fit has not converged. used (B,): samples with a marker and an equilibrium. residual (B, P, 3) m: measured
-    minus fitted, NaN where there is neither. chi2, dof, accepted: chi2 below its 99.9 % point. undetermined: names whose standard
-    deviation is half their size or more.
+    names: mass_per_length (kg/m), stiffness_factor (of K_se and K_bt alike, hence of E and G), tension_offset_1.. (N),
+    friction_1.., tendon_x_1.. (m), and so on as model.uncertainty has them, frame_x .. frame_turn_z (m, rad). std_noise: with the
+    stated noise; std: the same with the noise the residuals show, where chi2 / dof says that it is larger (`rescaled`); std is what
+    is reported, and interval_95 (n, 2), multiplicative for mass and stiffness, follows it. NaN where the fit has not converged.
+    covariance (n, n): of std, of log mass and log stiffness where those are sought. used (B,): samples with a marker and an
+    equilibrium. residual (B, P, 3) m: measured minus fitted, NaN where there is neither. chi2, dof, accepted: chi2 below its 99.9 %
+    point. undetermined: names of free unknowns whose standard deviation is half their size or more. alike: pairs of names that
+    these shapes cannot tell apart.
     """
 
     names: tuple[str, ...]
+    units: tuple[str, ...]
     before: Float[Tensor, " n"]
     values: Float[Tensor, " n"]
     std: Float[Tensor, " n"]
     std_noise: Float[Tensor, " n"]
     interval_95: Float[Tensor, "n 2"]
+    covariance: Float[Tensor, "n n"]
     undetermined: tuple[str, ...]
+    alike: tuple[tuple[str, str], ...]
     used: Bool[Tensor, " B"]
     residual: Float[Tensor, "B P 3"]
     chi2: float
     dof: int
     iterations: int
     status: Status
+    unknowns: tuple[Unknown, ...]
+    z: Float[Tensor, " n"]
 
     @property
     def accepted(self) -> bool:
@@ -74,7 +121,7 @@ class Calibration:
 
     @property
     def message(self) -> str:
-        """One sentence, with the remedy where there is something to do."""
+        """What came of it, with the remedy where there is something to do."""
         if self.status is not Status.CONVERGED:
             return (
                 f"Did not converge in {self.iterations} iterations: check units, gravity, tensions and marker order; then start "
@@ -85,125 +132,249 @@ class Calibration:
                 f"Converged, but these shapes hardly determine {', '.join(self.undetermined)}: add shapes at other tensions "
                 "or with gravity across the rod, or ask for fewer parameters."
             )
+        twins = "".join(f" These shapes do not tell {a} from {b}; only their common effect is known." for a, b in self.alike)
         if not self.accepted:
             return (
                 "Converged, but the calibrated robot does not explain the markers: state more noise, or check gravity's direction, "
-                "tensions, the base frame and that nothing touched the robot."
+                f"tensions, the base frame and that nothing touched the robot.{twins}"
             )
-        return "Converged."
+        return f"Converged.{twins}"
 
     def value(self, name: str, default: float) -> float:
         """The calibrated value of one unknown; the default where it was not asked for."""
         return float(self.values[self.names.index(name)]) if name in self.names else default
 
     def applied(self, robot: Robot) -> Robot:
-        """The robot with the calibrated values."""
-        k = self.value(STIFFNESS, 1.0)
-        mass = torch.tensor(self.value(MASS, float(robot.rod.mass_per_length)), dtype=DTYPE)
-        rod = replace(robot.rod, K_se=k * robot.rod.K_se, K_bt=k * robot.rod.K_bt, mass_per_length=mass)
-        tendons = tuple(
-            replace(t, tension_offset=self.value(f"{OFFSET}{j + 1}", t.tension_offset)) for j, t in enumerate(robot.tendons.tendons)
-        )
-        return replace(robot, rod=rod, tendons=Tendons(tendons))
+        """The robot with the calibrated values, but for the base frame (`frame`)."""
+        for unknown, z in zip(self.unknowns, self.z.tolist(), strict=True):
+            if unknown.name == MASS and not float(robot.rod.mass_per_length):  # which the search has started from
+                robot = replace(robot, rod=replace(robot.rod, mass_per_length=torch.tensor(unknown.before, dtype=DTYPE)))
+            if unknown.parameter is not None:
+                robot = unknown.parameter.change(robot, unknown.error(z))
+        return robot
+
+    @property
+    def frame(self) -> BaseFrame | None:
+        """The error of the base frame, where it was sought."""
+        at = [i for i, unknown in enumerate(self.unknowns) if unknown.parameter is None]
+        return BaseFrame(self.z[at], self.covariance[at][:, at]) if at else None
+
+    @property
+    def found(self) -> Found:
+        """What is left unknown of the robot's parameters."""
+        at = [i for i, unknown in enumerate(self.unknowns) if unknown.parameter is not None]
+        return Found(tuple(p.name for i in at if (p := self.unknowns[i].parameter)), self.covariance[at][:, at])
 
 
 def calibrate(
     robot: Robot,
-    markers: Markers,
+    markers: Markers | Sequence[Sensor],
     tension: Float[Tensor, "B T"] | None = None,
     youngs_modulus: bool = False,
     tension_offset: bool = False,
     settings: Settings | None = None,
     steps: int | None = None,
+    mass: bool = True,
+    free: Sequence[str] = (),
+    shared: Uncertainty | None = None,
+    frame: Registration | None = None,
+    own: Uncertainty | None = None,
+    hung: Float[Tensor, "B 2"] | None = None,
+    loads: LoadFamily | None = None,
 ) -> Calibration:
-    """Mass per length, and where asked stiffness and tension offsets, from the shapes of a robot that nothing touches but gravity.
+    """Parameters of a robot from shapes of it under loads that are known: none but gravity and tendons, or a weight that was hung.
 
-    markers: all samples are of one robot, with one noise for all; gravity (3,) or (B, 3), base frame. tension: (B, T) N, readings.
-    Missing markers weigh nothing; a sample without a marker or an equilibrium is left out (`used`). Non-convergence is a status.
-    Errors: ValueError, one sentence with the remedy, where the data cannot determine what is asked.
+    markers: what was read of all samples, of one robot; gravity (3,) or (B, 3), base frame. tension: (B, T) N, readings. mass,
+    youngs_modulus, tension_offset, free (kinds of `Uncertainty`, such as "friction"): what is sought of which nothing is known.
+    shared: what is sought of which this much is known, by standard deviations about the file's values. frame: the base frame's
+    error is sought, too, with such a prior. own: errors that are another in every sample, such as tensions from trial to trial.
+    hung: [s (m), mass (kg)] of a weight on each sample, 0 kg for none. loads: a family of loads that are not known either, of
+    every sample. Missing readings weigh nothing; a sample without a marker or an equilibrium is left out (`used`). Non-convergence
+    is a status. Errors: ValueError, one sentence with the remedy, where the data cannot determine what is asked.
     Source: the paper, section III.C and (3), (4); docs/model.md.
     """
-    none = Unknowns(GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale))
-    Problem(robot, none, [markers], tension).check()
-    steps = steps or steps_of_rod(robot, markers.s)  # the same for every trial, or their differences would jump
-    shapes = UnloadedShapes(robot, markers, tension, markers.weights[:, ::3], youngs_modulus, tension_offset, steps)
-    _refuse(shapes)
-    return _result(shapes, *_iterate(shapes, settings or Settings()))
-
-
-def _refuse(shapes: UnloadedShapes) -> None:
-    """Raise ValueError for what no data of this kind can determine."""
-    robot, markers = shapes.robot, shapes.markers
-    if not markers.isotropic:
-        raise ValueError("calibrate takes markers with one noise in all directions; give neither covariances nor s_std")
-    if not bool(robot.gravity.any()):
-        raise ValueError("the robot has no gravity, so its weight does not show; add gravity = [x, y, z] (m/s^2) to [rod]")
-    if shapes.offsets and not len(robot.tendons):
-        raise ValueError("the robot has no tendons, so there are no tension offsets; drop --tension-offset")
-    pulled = shapes.tension is not None and bool((shapes.tension > 0).any())
-    if shapes.stiffness and not pulled:
+    settings = settings or Settings()
+    sensors = [markers] if isinstance(markers, Markers) else list(markers)
+    none = loads or GaussianCoordinates(0, robot.rod.length, robot.rod.force_scale)
+    whole = Problem(robot, Unknowns(none, uncertainty=own), sensors, tension, steps or 0)
+    whole.check()
+    kinds = [*free, *(["mass"] if mass else []), *(["stiffness"] if youngs_modulus else [])]
+    kinds += ["tension_offset"] if tension_offset else []
+    start = _with_mass(robot) if mass else robot
+    _refuse_kinds(robot, kinds)
+    sought = _unknowns(start, tension, kinds, shared or Uncertainty(), frame)
+    _refuse(whole, sought, hung)
+    groups = _groups(whole, start, hung)
+    parts = [
+        replace(whole.take(index), robot=own_robot, steps=steps or steps_of_rod(robot, whole.s)) for own_robot, index in groups
+    ]
+    terms = [Shared((u.size,), (u.std,), _change(u, p)) for u in sought if (p := u.parameter) is not None]
+    terms += [] if frame is None else [shared_frame(whole, frame)]
+    try:
+        found = fit_jointly(parts, terms, replace(settings, max_iterations=INNER), settings.max_iterations)
+    except ValueError as error:
         raise ValueError(
-            "without tension only the ratio of weight to stiffness shows; add shapes with tension or drop --youngs-modulus"
-        )
-    seen, unknowns = 3 * int(markers.present.sum()), len(shapes.names)
-    if seen <= unknowns:
-        raise ValueError(f"{seen} marker coordinates cannot determine {unknowns} parameters; add markers or shapes")
+            f"{error} at {float(start.rod.mass_per_length):.3g} kg/m; check the units of tensions and stiffness, or start from "
+            "another mass_per_length"
+        ) from None
+    return _result(whole, sought, found, [index for _, index in groups], robot)
 
 
-def _iterate(shapes: UnloadedShapes, settings: Settings) -> tuple[Float[Tensor, " n"], Trial, int, Status]:
-    """The filter on theta: estimation.filter's `advance` on a batch of one."""
-    mean, limits = shapes.start(), ekf.Limits(step=settings.step_limit)
-    prior, Q = (mean, torch.full_like(mean, PRIOR)), settings.Q * torch.ones_like(mean)
-    Sigma0 = settings.initial_covariance(mean)[None]
-    at = ekf.Iterate.start(mean[None], Sigma0, torch.inf if settings.adaptive else 0.0)
-    kept, retreats = torch.zeros(len(shapes.weights), dtype=torch.bool), 0
-    for iteration in range(1, settings.max_iterations + 1):
-        trial = shapes.linearize(at.x[0], mean)
-        if bool((kept & ~trial.solved).any()) and retreats < RETREATS:
-            # A step too far: half way back to the last place where these samples had an equilibrium.
-            at, retreats = replace(at, x=0.5 * (at.x + at.before)), retreats + 1
-            continue
-        if not bool((trial.w > 0).any()):
-            if iteration > 1:
-                return at.x[0], trial, iteration, Status.NOT_CONVERGED
-            raise ValueError(
-                f"no sample has markers, finite tensions and an equilibrium at {float(mean[0].exp()):.3g} kg/m; check the units "
-                "of tensions and stiffness, or start from another mass_per_length"
+def _with_mass(robot: Robot) -> Robot:
+    """The robot; without a mass in the file, with one that lets the tip sag: rho g L^4 / (8 EI) = FIRST_SAG L."""
+    rod = robot.rod
+    if float(rod.mass_per_length) or not bool(robot.gravity.any()):
+        return robot
+    sagging = 8 * FIRST_SAG * rod.bending_stiffness / (rod.length**3 * float(robot.gravity.norm(dim=-1).max()))
+    return replace(robot, rod=replace(rod, mass_per_length=torch.tensor(sagging, dtype=DTYPE)))
+
+
+def _unknowns(
+    robot: Robot, tension: Float[Tensor, "B T"] | None, free: Sequence[str], shared: Uncertainty, frame: Registration | None
+) -> tuple[Unknown, ...]:
+    """What is sought, in its order."""
+    known = {p.name: p for p in shared.parameters(robot)}
+    every = replace(shared, found=None, **dict.fromkeys(free, 0.5)).parameters(robot)
+    found = []
+    for parameter in every:
+        std = known[parameter.name].std if parameter.name in known else None
+        size, before, unit = _measure(robot, tension, parameter)
+        kind = parameter.name
+        found.append(
+            Unknown(
+                PUBLIC.get(kind, kind),
+                unit,
+                before,
+                size,
+                FREE * size if std is None else std,
+                parameter.relative,
+                parameter,
             )
-        onward = ekf.advance(at, trial.normal, Sigma0, prior, Q, limits)
-        if bool(onward.done):
-            return at.x[0], trial, iteration, Status.CONVERGED
-        kept, retreats = trial.solved, 0
-        at = replace(onward, x=shapes.stopped_at_kinks(at.x[0], (onward.x - at.x)[0])[None])
-    return at.x[0], shapes.linearize(at.x[0], mean), settings.max_iterations, Status.NOT_CONVERGED
+        )
+    if frame is not None:
+        block = shared_frame(Problem(robot, Unknowns(GaussianCoordinates(0, robot.rod.length, 1.0)), [], tension), frame)
+        for axis, size, std in zip(FRAME_AXES, block.size, block.std, strict=True):
+            found.append(Unknown(FRAME + axis, "rad" if axis.startswith("turn") else "m", 0.0, size, std))
+    return tuple(found)
 
 
-def _result(shapes: UnloadedShapes, theta: Float[Tensor, " n"], trial: Trial, iterations: int, status: Status) -> Calibration:
-    """Values and standard deviations in SI units, residuals and chi2 at theta."""
-    r, w = trial.r, trial.w
-    chi2, dof = float((w * r * r).sum()), int((w > 0).sum()) - len(theta)
+def _measure(robot: Robot, tension: Float[Tensor, "B T"] | None, parameter: Parameter) -> tuple[float, float, str]:
+    """Size, value so far and unit of a parameter."""
+    kind, _, which = parameter.name.rpartition("_")
+    rod, tendons = robot.rod, robot.tendons.tendons
+    if parameter.name == "mass":
+        return 1.0, float(rod.mass_per_length), "kg/m"
+    if parameter.relative:
+        return 1.0, 1.0 if not which.isdigit() else tendons[int(which) - 1].tension_gain, "1"
+    if kind == "tension_offset":
+        largest = 0.0 if tension is None else float(tension.nan_to_num(0.0)[:, int(which) - 1].max())
+        return largest or rod.force_scale, tendons[int(which) - 1].tension_offset, "N"
+    if kind == "friction":
+        own = tendons[int(which) - 1]
+        return 1.0, own.friction * own.motion, "1"
+    if kind in ("tendon_x", "tendon_y"):
+        own = tendons[int(which) - 1].routing[0]
+        return math.hypot(*own[1:]) or 0.01 * rod.length, own[1 if kind.endswith("x") else 2], "m"
+    if kind == "gravity":
+        return 0.3, 0.0, "rad"
+    return 1 / rod.length, 0.0, "1/m"  # set_x, curvature_y_3, ..
+
+
+def _change(unknown: Unknown, parameter: Parameter) -> Callable[[Problem, Tensor], Problem]:
+    """What a value of z does to a problem."""
+    return lambda problem, z: replace(problem, robot=parameter.change(problem.robot, unknown.error(float(z))))
+
+
+def _refuse_kinds(robot: Robot, kinds: Sequence[str]) -> None:
+    """Raise ValueError for what the robot has not."""
+    if "mass" in kinds and not bool(robot.gravity.any()):
+        raise ValueError("the robot has no gravity, so its weight does not show; add gravity = [x, y, z] (m/s^2) to [rod]")
+    if unknown := [kind for kind in kinds if kind not in KINDS or kind == "curvature_length"]:
+        named = ", ".join(kind for kind in KINDS if kind != "curvature_length")
+        raise ValueError(f"there is no parameter {unknown[0]}; it must be one of {named}")
+    if not len(robot.tendons):
+        for kind in kinds:
+            if kind in OF_TENDONS:
+                option = "--tension-offset" if kind == "tension_offset" else kind
+                raise ValueError(f"the robot has no tendons, so there is no {kind.replace('_', ' ')} of them; drop {option}")
+
+
+def _refuse(problem: Problem, sought: tuple[Unknown, ...], hung: Float[Tensor, "B 2"] | None) -> None:
+    """Raise ValueError for what no data of this kind can determine."""
+    names = [u.name for u in sought]
+    free = [u.name for u in sought if u.free]
+    if not sought:
+        raise ValueError("nothing is sought; ask for a parameter, or state how well some are known")
+    pulled = problem.tension is not None and bool((problem.tension > 0).any())
+    loaded = hung is not None and bool((hung[:, 1] > 0).any())
+    if STIFFNESS in free and MASS in names and not pulled and not loaded:
+        raise ValueError(
+            "without tension only the ratio of weight to stiffness shows; add shapes with tension or a known weight, or drop "
+            "--youngs-modulus"
+        )
+    seen = int(problem.seen.sum())
+    if seen <= len(free):
+        raise ValueError(f"{seen} marker coordinates cannot determine {len(free)} parameters; add markers or shapes")
+
+
+def _groups(problem: Problem, robot: Robot, hung: Float[Tensor, "B 2"] | None) -> list[tuple[Robot, Int[Tensor, " b"]]]:
+    """Samples with the same gravity and the same weight hung on them, and the robot that they are of."""
+    B = problem.batch
+    rows = robot.gravity.expand(B, 3)
+    rows = torch.cat([rows, rows.new_zeros(B, 2) if hung is None else hung * (hung[:, 1:] > 0)], -1)
+    kinds, which = torch.unique(rows, dim=0, return_inverse=True)
+    found = []
+    for k, (*g, s, kg) in enumerate(kinds.tolist()):
+        weight = torch.tensor([[s, kg]], dtype=DTYPE)[: int(kg > 0)]
+        rod = replace(robot.rod, masses=torch.cat([robot.rod.masses, weight]))
+        found.append((replace(robot, rod=rod, gravity=torch.tensor(g, dtype=DTYPE)), (which == k).nonzero().squeeze(-1)))
+    return found
+
+
+def _result(
+    problem: Problem, sought: tuple[Unknown, ...], found: Joint, groups: list[Int[Tensor, " b"]], robot: Robot
+) -> Calibration:
+    """Values and standard deviations in SI units, residuals and chi2."""
+    B, z = problem.batch, found.z
+    used = torch.zeros(B, dtype=torch.bool)
+    residual = problem.reading.new_full((B, problem.distances(problem.weights).shape[1], 3), torch.nan)
+    chi2, dof = 0.0, -len(sought) + sum(not u.free for u in sought)
+    for index, fit, some in zip(groups, found.fits, found.used, strict=True):
+        used[index], residual[index[some]] = some, fit.residual[some]
+        chi2, dof = chi2 + float(fit.chi2[some].sum()), dof + int(fit.dof[some].sum())
+    chi2 += float((found.prior.diagonal() * z**2).sum())
     excess = max(1.0, chi2 / max(dof, 1))
-    prior = torch.diag(torch.full_like(theta, PRIOR))
-    values, log, names = shapes.physical(theta), shapes.logarithmic, shapes.names
-    unknown = math.nan if status is not Status.CONVERGED else 1.0
-    stated, std = (unknown * ekf.inverse(trial.A_mean / factor + prior)[0].diagonal().sqrt() for factor in (1.0, excess))
-    size = torch.where(log, values, shapes.unit)
-    reach = Z95 * torch.stack([-std, std], -1)
-    around = values.unsqueeze(-1)
-    interval = torch.where(log.unsqueeze(-1), around * reach.exp(), around + reach * size.unsqueeze(-1))
-    residual = torch.where(w > 0, r, torch.nan).reshape(shapes.markers.positions.shape)
+    known = torch.nan if found.status is not Status.CONVERGED else 1.0
+    stated, covariance = (known * found.covariance(factor) for factor in (1.0, excess))
+    std_z = covariance.diagonal().sqrt()
+    log = torch.tensor([u.logarithmic for u in sought])
+    values = torch.stack([u.value(v) for u, v in zip(sought, z, strict=True)])
+    unit = torch.where(log, values, 1.0)
+    reach, around = Z95 * torch.stack([-std_z, std_z], -1), values.unsqueeze(-1)
+    interval = torch.where(log.unsqueeze(-1), around * reach.exp(), around + reach)
+    hardly = [u.name for u, s in zip(sought, std_z.tolist(), strict=True) if u.free and s > HARDLY * u.size]
+    correlation = covariance / std_z / std_z.unsqueeze(-1)
+    pairs = [(i, j) for i in range(len(sought)) for j in range(i) if abs(float(correlation[i, j])) > ALIKE]
+    before = torch.tensor([u.before for u in sought], dtype=DTYPE)
+    if MASS in (u.name for u in sought) and not float(robot.rod.mass_per_length):
+        before = before.index_fill(0, torch.tensor([[u.name for u in sought].index(MASS)]), 0.0)
     return Calibration(
-        names,
-        shapes.before(),
+        tuple(u.name for u in sought),
+        tuple(u.unit for u in sought),
+        before,
         values,
-        std * size,
-        stated * size,
+        std_z * unit,
+        stated.diagonal().sqrt() * unit,
         interval,
-        tuple(name for name, s in zip(names, std.tolist(), strict=True) if s > HARDLY),
-        trial.solved & shapes.markers.present.any(-1),
+        covariance,
+        tuple(hardly),
+        tuple((sought[j].name, sought[i].name) for i, j in pairs),
+        used,
         residual,
         chi2,
         dof,
-        iterations,
-        status,
+        found.iterations,
+        found.status,
+        sought,
+        z,
     )

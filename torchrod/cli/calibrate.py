@@ -6,11 +6,10 @@ from pathlib import Path
 
 from jsonargparse import Namespace
 
-from ..analysis.calibration import Calibration
+from ..analysis.calibration import STIFFNESS, Calibration
 from ..analysis.calibration import calibrate as run_calibration
-from ..analysis.unloaded_shapes import STIFFNESS
 from ..estimation.solve import Settings
-from ..io import CALIBRATION_SUFFIXES, Shapes, read_robot, read_shapes, unit_of, write_calibrated, write_calibration
+from ..io import CALIBRATION_SUFFIXES, Shapes, read_robot, read_shapes, write_calibrated, write_calibration
 from ..mechanics.robot import Robot
 from ..util.errors import InputError
 from ..util.status import Status
@@ -64,7 +63,7 @@ def _rows(found: Calibration, path: str) -> list[tuple[str, float, float, float]
     modulus = tomllib.loads(Path(path).read_text(encoding="utf-8"))["rod"].get("youngs_modulus")
     rows = []
     for i, name in enumerate(found.names):
-        label, size = f"{name} ({unit_of(name)})", 1.0
+        label, size = f"{name} ({found.units[i]})", 1.0
         if name == STIFFNESS and modulus is not None:
             label, size = "youngs_modulus (Pa)", float(modulus)
         rows.append((label, *(size * float(x[i]) for x in (found.before, found.values, found.std))))

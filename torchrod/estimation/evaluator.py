@@ -51,6 +51,14 @@ class Evaluator(Protocol):
         """The samples of an index."""
         ...
 
+    def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
+        """See Problem."""
+        ...
+
+    def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
+        """See Problem."""
+        ...
+
     def cost(self, x: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
         """The cost of (3) with the prior's, r^T W r + (x0 - x)^T P (x0 - x)."""
         ...

@@ -1,7 +1,7 @@
 """Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ), calibrations and what markers see (JSON)."""
 
 from .base_pose import BasePose
-from .calibration_file import CALIBRATION_SUFFIXES, unit_of, write_calibration
+from .calibration_file import CALIBRATION_SUFFIXES, write_calibration
 from .observability_file import write_observability, write_observability_table
 from .result_file import RESULT_SUFFIXES, read_fit, write_result
 from .robot_file import read_base_pose, read_robot
@@ -22,7 +22,6 @@ __all__ = [
     "read_robot",
     "read_shapes",
     "read_uncertainty",
-    "unit_of",
     "write_calibrated",
     "write_calibration",
     "write_observability",

@@ -3,15 +3,9 @@
 from pathlib import Path
 
 from ..analysis.calibration import Calibration
-from ..analysis.unloaded_shapes import MASS, OFFSET
 from .json_file import plain, put_json
 
 CALIBRATION_SUFFIXES = (".json",)
-
-
-def unit_of(name: str) -> str:
-    """The unit of a calibrated parameter: kg/m, N, or 1 for a factor."""
-    return "kg/m" if name == MASS else "N" if name.startswith(OFFSET) else "1"
 
 
 def write_calibration(path: str | Path, calibration: Calibration, samples: list[str], robot: str, noise: float) -> None:
@@ -33,7 +27,7 @@ def write_calibration(path: str | Path, calibration: Calibration, samples: list[
         "parameters": [
             {
                 "name": name,
-                "unit": unit_of(name),
+                "unit": c.units[i],
                 "before": plain(float(c.before[i])),
                 "after": plain(float(c.values[i])),
                 "std": plain(float(c.std[i])),

@@ -1,16 +1,16 @@
 """[uncertainty] of ROBOT.toml: how well the robot, and its base frame, are known."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..model.uncertainty import Uncertainty
+from ..model.uncertainty import KINDS, Uncertainty
 from ..model.unknowns import Registration
 from ..util.errors import InputError, shown
 from .values import as_number, as_numbers, as_table, in_si, read_toml
 
 FRAME = "frame"
-KEYS = {field.name for field in fields(Uncertainty)} | {FRAME}
+KEYS = {*KINDS, FRAME}
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def uncertainty_of(path: Path, content: dict[str, Any]) -> NearlyKnown:
         return NearlyKnown()
     where = f"{path}: uncertainty"
     table = as_table(where, in_si(where, content["uncertainty"], {"curvature_length"}, {"gravity"}), KEYS)
-    values = {name: as_number(f"{where}.{name}", value) for name, value in table.items() if name != FRAME}
+    values: dict[str, Any] = {name: as_number(f"{where}.{name}", value) for name, value in table.items() if name != FRAME}
     try:
         stated = Uncertainty(**values)
     except ValueError as error:

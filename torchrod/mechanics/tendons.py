@@ -27,9 +27,9 @@ class Tendon:
 
     routing: rows [s, x, y] (m): its offset from the centre line in the section frame; one row is a straight tendon, more rows
     are joined by a C2 cubic spline in s. ends_at: arc length (m) at which it is fixed to the rod.
-    tension_offset: N, added to every reading of its load cell (`Tendons.true_tension`). friction: mu, its coefficient of friction
-    on the robot (`turning_rate`). motion: 1 while it is pulled, -1 while it is let out, anything between where that is not known;
-    what counts is motion times friction. Errors: ValueError for what is no tendon.
+    tension_offset, tension_gain: N and 1, what makes a reading of its load cell its tension (`Tendons.true_tension`).
+    friction: mu, its coefficient of friction on the robot (`turning_rate`). motion: 1 while it is pulled, -1 while it is let out,
+    anything between where that is not known; what counts is motion times friction. Errors: ValueError for what is no tendon.
     """
 
     routing: tuple[tuple[float, float, float], ...]
@@ -37,6 +37,7 @@ class Tendon:
     tension_offset: float = 0.0
     friction: float = 0.0
     motion: float = 1.0
+    tension_gain: float = 1.0
 
     def __post_init__(self):
         if not self.routing or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in self.routing):
@@ -47,6 +48,8 @@ class Tendon:
             raise ValueError(f"a tendon ends at {self.ends_at} m; it must be positive and finite")
         if not math.isfinite(self.tension_offset):
             raise ValueError(f"a tendon's tension_offset is {self.tension_offset} N; it must be finite")
+        if not (math.isfinite(self.tension_gain) and self.tension_gain > 0):
+            raise ValueError(f"a tendon's tension_gain is {self.tension_gain}; it must be positive and finite")
         if not math.isfinite(self.friction):
             raise ValueError(f"a tendon's friction is {self.friction}; it must be finite")
         if not -1 <= self.motion <= 1:
@@ -123,8 +126,9 @@ class Tendons:
         return torch.tensor(mu, dtype=DTYPE) if any(mu) else None
 
     def true_tension(self, reading: Float[Tensor, "... T"], clamped: bool = True) -> Float[Tensor, "... T"]:
-        """tau = max(reading + tension_offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
-        tau = reading + torch.tensor([t.tension_offset for t in self.tendons], dtype=DTYPE)
+        """tau = max(gain reading + offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
+        gain, offset = (torch.tensor([getattr(t, f"tension_{k}") for t in self.tendons], dtype=DTYPE) for k in ("gain", "offset"))
+        tau = gain * reading + offset
         return tau.clamp(min=0.0) if clamped else tau
 
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:

@@ -286,7 +286,7 @@ class Problem(Float64):
         return self.tension if self.tension is None or not tension.size else self.tension + tension.of(x)
 
     def shape(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Shape:
-        """The rod at the sensors' arc lengths, in its own base frame; what is only nearly known of it as the robot's file has it."""
+        """The rod at the sensors' arc lengths, in its own base frame; what is only nearly known of it as its file has it."""
         state = self.state
         if state.parameters.size:
             return self.exact.shape(self.without_parameters(x)[0], differentiable)
@@ -315,12 +315,10 @@ class Problem(Float64):
         """With every parameter off by a standard deviation, upwards and downwards, in turn; x in the units of the exact one."""
         exact, found = self.exact, []
         assert self.unknowns.uncertainty is not None
-        for parameter in self.unknowns.uncertainty.parameters(self.robot):
-            for error in (parameter.std, -parameter.std):
-                robot, tension = parameter.change(exact.robot, exact.tension, error)
-                other = replace(exact, robot=robot, tension=tension)
-                vars(other)["state"] = exact.state
-                found.append(other)
+        for robot in self.unknowns.uncertainty.nearby(exact.robot):
+            other = replace(exact, robot=robot)
+            vars(other)["state"] = exact.state
+            found.append(other)
         return found
 
     def without_parameters(self, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... m"], Float[Tensor, "... k"]]:

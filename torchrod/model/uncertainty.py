@@ -6,7 +6,8 @@ error unknown, within what is known of it, intervals hold (docs/trust.md). The m
     (1)  h(x, theta) = h(x, 0) + sum_k theta_k (h_k+ - h_k-) / 2 + theta_k^2 (h_k+ + h_k- - 2 h(x, 0)) / 2,    theta_k ~ N(0, 1)
 
 through h(x, 0) and h_k+-, of a robot whose parameter k is off by one standard deviation upwards and downwards; the errors of two
-parameters act side by side. dh/dx follows by the same parabola.
+parameters act side by side. dh/dx follows by the same parabola. Where a calibration has found errors that are correlated, theta_k
+moves all of them along a column of a root of their covariance.
 """
 
 import math
@@ -19,33 +20,60 @@ from torch import Tensor
 
 from ..mechanics.robot import Robot
 from ..mechanics.rod import Rod
-from ..mechanics.tendons import Tendons
-from ..util.precision import DTYPE
+from ..mechanics.tendons import Tendon, Tendons
+from ..util.precision import DTYPE, Float64
 
 MOST_SHARE = 0.5  # of a number whose error is relative: with more, one standard deviation leaves next to nothing of it
 KNOTS = 10  # pieces of the length over which an error of the curvature is one, where no length is stated
-Tension = Float[Tensor, "B T"] | None
-Change = Callable[[Robot, Tension, float], tuple[Robot, Tension]]
+RELATIVE = ("stiffness", "mass", "tension")  # errors that are shares of a number
+OF_TENDONS = ("tension", "tension_offset", "friction", "tendon_place")
+NONE = 1e-12  # of a standard deviation: what is left of a direction that is none
+Change = Callable[[Robot, float], Robot]
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a robot: name, the SI unit of its error, its standard deviation, what an error does to robot and tension."""
+    """One number of a robot: name, the SI unit of its error, its standard deviation, what an error does to the robot."""
 
     name: str
     unit: str
     std: float
     change: Change
 
+    @property
+    def relative(self) -> bool:
+        """Whether its error is a share of a number that is positive."""
+        return self.name.split("_")[0] in RELATIVE and "offset" not in self.name
+
+
+@dataclass(frozen=True)
+class Found(Float64):
+    """What a calibration leaves unknown: the covariance of the errors of parameters, by their names, in their units."""
+
+    names: tuple[str, ...]
+    covariance: Float[Tensor, "k k"]
+
+    def __post_init__(self):
+        super().__post_init__()
+        C, k = self.covariance, len(self.names)
+        if len(set(self.names)) < k:
+            raise ValueError("Found.names names a parameter twice")
+        if C.shape != (k, k) or not bool(torch.isfinite(C).all()) or not torch.allclose(C, C.mT, rtol=1e-6, atol=0):
+            raise ValueError(f"Found.covariance must be a symmetric matrix with {k} rows of finite numbers, one for each name")
+        if k and float(torch.linalg.eigvalsh(_correlation(C)).min()) < -1e-6:
+            raise ValueError("Found.covariance is no covariance: it has a negative eigenvalue")
+
 
 @dataclass(frozen=True)
 class Uncertainty:
     """Standard deviations of a robot's parameters, each about what its file says; 0: exact.
 
-    stiffness, mass: relative, of the whole rod. tension: relative, of every tendon's reading. friction: of every tendon's motion
-    times mu. set: 1/m, a curvature of the whole unloaded rod, about x and about y. curvature: 1/m, one that changes along the rod
-    within curvature_length (m; None: a tenth of the rod): the catch-all for discs, glue, tubing and backlash. gravity: rad, its
-    direction. Errors: ValueError for what is no standard deviation.
+    stiffness, mass: relative, of the whole rod (without what hangs on it at points). tension: relative, of every tendon's
+    reading. friction: of every tendon's motion times mu. set: 1/m, a curvature of the whole unloaded rod, about x and about y.
+    curvature: 1/m, one that changes along the rod within curvature_length (m; None: a tenth of the rod): the catch-all for discs,
+    glue, tubing and backlash. gravity: rad, its direction. tension_offset: N, of every reading. tendon_place: m, of every tendon in
+    the section, along x and along y. found: what a calibration has left unknown, errors of the robot that come on top of the
+    others. Errors: ValueError for what is no standard deviation.
     """
 
     stiffness: float = 0.0
@@ -56,91 +84,149 @@ class Uncertainty:
     curvature: float = 0.0
     curvature_length: float | None = None
     gravity: float = 0.0
+    tension_offset: float = 0.0
+    tendon_place: float = 0.0
+    found: Found | None = None
 
     def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            least = value is not None and (value > 0 if field.name == "curvature_length" else value >= 0)
+        for name in KINDS:
+            value = getattr(self, name)
+            least = value is not None and (value > 0 if name == "curvature_length" else value >= 0)
             if value is not None and not (least and value < math.inf):
-                raise ValueError(f"Uncertainty.{field.name} is {value}; it must be a finite standard deviation, at least 0")
-        for name in ("stiffness", "mass", "tension"):
+                raise ValueError(f"Uncertainty.{name} is {value}; it must be a finite standard deviation, at least 0")
+        for name in RELATIVE:
             if (share := getattr(self, name)) > MOST_SHARE:
                 raise ValueError(f"Uncertainty.{name} is {share}; it is a share, 0.05 for 5 %, and may be at most {MOST_SHARE}")
 
     def prepared(self, robot: Robot) -> Robot:
         """The robot with rows of its reference curvature where `curvature` bends it, so that robots compared have one grid."""
-        if not self.curvature:
+        if not self.curvature and not self._found_along:
             return robot
         return replace(robot, rod=replace(robot.rod, reference_curvature=_with_rows(robot.rod, self._knots(robot.rod))))
 
+    @property
+    def _found_along(self) -> bool:
+        return self.found is not None and any(name.startswith("curvature_") for name in self.found.names)
+
     def parameters(self, robot: Robot) -> tuple[Parameter, ...]:
-        """What is unknown of a robot; friction and tension where it has tendons, mass and gravity where it has weight."""
-        found = []
-        if self.stiffness:
-            found.append(Parameter("stiffness", "1", self.stiffness, _stiffness))
-        if self.mass and not robot.weightless:
-            found.append(Parameter("mass", "1", self.mass, _mass))
+        """What is unknown of a robot; that of tendons where it has some, mass and gravity where it has weight.
+
+        Errors: ValueError where a calibration has found a parameter that the robot has not.
+        """
+        stated = {p.name: p for p in self._of(robot, {name: getattr(self, name) for name in KINDS}) if p.std}
+        if self.found is None:
+            return tuple(stated.values())
+        every = {p.name: p for p in self._of(robot, dict.fromkeys(KINDS, 1.0))}
+        if missing := [name for name in self.found.names if name not in every]:
+            raise ValueError(f"the robot has no {missing[0]}, which was calibrated; calibrate it again")
+        names = list(dict.fromkeys([*stated, *self.found.names]))
+        std = {name: stated[name].std if name in stated else 0.0 for name in names}
+        own = dict(zip(self.found.names, self.found.covariance.diagonal().tolist(), strict=True))
+        return tuple(replace(every[name], std=math.sqrt(std[name] ** 2 + own.get(name, 0.0))) for name in names)
+
+    def root(self, robot: Robot) -> Float[Tensor, "k k"]:
+        """L with L L^T the covariance of the errors of `parameters`: errors are L xi, xi ~ N(0, 1) what is unknown of a sample."""
+        listed = self.parameters(robot)
+        std = torch.tensor([p.std for p in listed], dtype=DTYPE)
+        if self.found is None or not listed:
+            return torch.diag(std)
+        at = torch.tensor([[p.name for p in listed].index(name) for name in self.found.names], dtype=torch.int64)
+        C = torch.diag(std**2)
+        C[at.unsqueeze(-1), at] += self.found.covariance - torch.diag(self.found.covariance.diagonal())
+        return std.unsqueeze(-1) * torch.linalg.cholesky(_correlation(C) + NONE * torch.eye(len(C), dtype=DTYPE))
+
+    def nearby(self, robot: Robot) -> list[Robot]:
+        """Robots off by one of every unknown xi, upwards and downwards, in turn."""
+        listed, found = self.parameters(robot), []
+        for errors in self.root(robot).mT.tolist():
+            for sign in (1.0, -1.0):
+                off = robot
+                for parameter, error in zip(listed, errors, strict=True):
+                    off = parameter.change(off, sign * error) if error else off
+                found.append(off)
+        return found
+
+    def _of(self, robot: Robot, std: dict[str, float]) -> list[Parameter]:
+        """All that a robot has, with these standard deviations of their kinds."""
+        heavy = not robot.weightless
+        found = [Parameter("mass", "1", std["mass"], _mass)] if heavy and bool(robot.rod.mass_per_length > 0) else []
+        found.append(Parameter("stiffness", "1", std["stiffness"], _stiffness))
         for j in range(len(robot.tendons)):
-            if self.tension:
-                found.append(Parameter(f"tension_{j + 1}", "1", self.tension, _tension(j)))
-            if self.friction:
-                found.append(Parameter(f"friction_{j + 1}", "1", self.friction, _friction(j)))
-        if self.gravity and not robot.weightless:
-            found += [Parameter(f"gravity_{k + 1}", "rad", self.gravity, _gravity(k)) for k in range(2)]
+            found += [
+                Parameter(f"tension_{j + 1}", "1", std["tension"], _tension(j)),
+                Parameter(f"tension_offset_{j + 1}", "N", std["tension_offset"], _tension_offset(j)),
+                Parameter(f"friction_{j + 1}", "1", std["friction"], _friction(j)),
+                *(Parameter(f"tendon_{x}_{j + 1}", "m", std["tendon_place"], _tendon_place(j, k)) for k, x in enumerate("xy")),
+            ]
+        found += [Parameter(f"gravity_{k + 1}", "rad", std["gravity"], _gravity(k)) for k in range(2)] if heavy else []
         for axis, name in enumerate("xy"):
-            if self.set:
-                found.append(Parameter(f"set_{name}", "1/m", self.set, _curvature(axis, None)))
-            if self.curvature:
-                knots = self._knots(robot.rod)
-                for k in range(len(knots)):
-                    found.append(Parameter(f"curvature_{name}_{k + 1}", "1/m", self.curvature, _curvature(axis, (knots, k))))
-        return tuple(found)
+            found.append(Parameter(f"set_{name}", "1/m", std["set"], _curvature(axis, None)))
+            knots = self._knots(robot.rod) if std["curvature"] else []
+            for k in range(len(knots)):
+                found.append(Parameter(f"curvature_{name}_{k + 1}", "1/m", std["curvature"], _curvature(axis, (knots, k))))
+        return found
 
     def _knots(self, rod: Rod) -> list[float]:
         count = max(1, round(rod.length / (self.curvature_length or rod.length / KNOTS)))
         return torch.linspace(0, rod.length, count + 1, dtype=DTYPE).tolist()
 
 
-def _stiffness(robot: Robot, tension: Tension, error: float) -> tuple[Robot, Tension]:
+KINDS = tuple(field.name for field in fields(Uncertainty) if field.name != "found")
+
+
+def _correlation(C: Float[Tensor, "k k"]) -> Float[Tensor, "k k"]:
+    d = C.diagonal().clamp(min=1e-300).sqrt()
+    return C / d / d.unsqueeze(-1)
+
+
+def _stiffness(robot: Robot, error: float) -> Robot:
     rod = robot.rod
-    return replace(robot, rod=replace(rod, K_se=(1 + error) * rod.K_se, K_bt=(1 + error) * rod.K_bt)), tension
+    return replace(robot, rod=replace(rod, K_se=(1 + error) * rod.K_se, K_bt=(1 + error) * rod.K_bt))
 
 
-def _mass(robot: Robot, tension: Tension, error: float) -> tuple[Robot, Tension]:
-    return replace(robot, gravity=(1 + error) * robot.gravity), tension
+def _mass(robot: Robot, error: float) -> Robot:
+    return replace(robot, rod=replace(robot.rod, mass_per_length=(1 + error) * robot.rod.mass_per_length))
+
+
+def _of_tendon(j: int, changed: Callable[[Tendon, float], Tendon]) -> Change:
+    def change(robot: Robot, error: float) -> Robot:
+        tendons = list(robot.tendons.tendons)
+        tendons[j] = changed(tendons[j], error)
+        return replace(robot, tendons=Tendons(tuple(tendons)))
+
+    return change
 
 
 def _tension(j: int) -> Change:
-    def change(robot: Robot, tension: Tension, error: float) -> tuple[Robot, Tension]:
-        if tension is None:
-            return robot, None
-        factor = torch.ones(tension.shape[-1], dtype=DTYPE)
-        factor[j] += error
-        return robot, tension * factor
+    return _of_tendon(j, lambda own, error: replace(own, tension_gain=(1 + error) * own.tension_gain))
 
-    return change
+
+def _tension_offset(j: int) -> Change:
+    return _of_tendon(j, lambda own, error: replace(own, tension_offset=own.tension_offset + error))
 
 
 def _friction(j: int) -> Change:
-    def change(robot: Robot, tension: Tension, error: float) -> tuple[Robot, Tension]:
-        tendons = list(robot.tendons.tendons)
-        own = tendons[j]
-        tendons[j] = replace(own, friction=own.friction * own.motion + error, motion=1.0)
-        return replace(robot, tendons=Tendons(tuple(tendons))), tension
+    return _of_tendon(j, lambda own, error: replace(own, friction=own.friction * own.motion + error, motion=1.0))
 
-    return change
+
+def _tendon_place(j: int, axis: int) -> Change:
+    def moved(own: Tendon, error: float) -> Tendon:
+        shift = (error, 0.0) if axis == 0 else (0.0, error)
+        return replace(own, routing=tuple((s, x + shift[0], y + shift[1]) for s, x, y in own.routing))
+
+    return _of_tendon(j, moved)
 
 
 def _gravity(k: int) -> Change:
     """Turned about one of two axes normal to it."""
 
-    def change(robot: Robot, tension: Tension, error: float) -> tuple[Robot, Tension]:
+    def change(robot: Robot, error: float) -> Robot:
         g = robot.gravity
         least = torch.nn.functional.one_hot(g.abs().argmin(-1), 3).to(g.dtype)
         first = torch.linalg.cross(g, least)
         first = first * (g.norm(dim=-1, keepdim=True) / first.norm(dim=-1, keepdim=True))
         across = first if k == 0 else torch.linalg.cross(g, first) / g.norm(dim=-1, keepdim=True)
-        return replace(robot, gravity=math.cos(error) * g + math.sin(error) * across), tension
+        return replace(robot, gravity=math.cos(error) * g + math.sin(error) * across)
 
     return change
 
@@ -148,7 +234,7 @@ def _gravity(k: int) -> Change:
 def _curvature(axis: int, bump: tuple[list[float], int] | None) -> Change:
     """About an axis of the section, everywhere or, as a hat between its neighbours, at one of the knots."""
 
-    def change(robot: Robot, tension: Tension, error: float) -> tuple[Robot, Tension]:
+    def change(robot: Robot, error: float) -> Robot:
         rows = robot.rod.reference_curvature.clone()
         if bump is None:
             rows[:, 1 + axis] += error
@@ -156,7 +242,7 @@ def _curvature(axis: int, bump: tuple[list[float], int] | None) -> Change:
             knots, k = torch.tensor(bump[0], dtype=DTYPE), bump[1]
             hat = torch.zeros_like(knots).index_fill(0, torch.tensor([k]), 1.0)
             rows[:, 1 + axis] += error * _interpolated(rows[:, 0], knots, hat)
-        return replace(robot, rod=replace(robot.rod, reference_curvature=rows)), tension
+        return replace(robot, rod=replace(robot.rod, reference_curvature=rows))
 
     return change
 

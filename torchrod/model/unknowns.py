@@ -57,7 +57,8 @@ class Registration:
 class Block:
     """A named part of x.
 
-    at: its slice. unit (k,): SI value of one unit of each entry (N, N m, m, rad; 1 for a load family's own entries). mean,
+    at: its slice. unit (k,): SI value of one unit of each entry (N, N m, m, rad; 1 for a load family's own entries). root (k, k):
+    where entries are errors that go together, the matrix that makes SI values of them instead, L of `Uncertainty.root`. mean,
     precision (k,): its Gaussian prior in those units; precision 0 where (17) or the data alone hold it. informative: how many of
     its priors count as data in the chi-square test.
     """
@@ -69,6 +70,7 @@ class Block:
     precision: Float[Tensor, " k"]
     scope: Scope = Scope.SAMPLE
     informative: int = 0
+    root: Float[Tensor, "k k"] | None = None
 
     @property
     def size(self) -> int:
@@ -77,11 +79,12 @@ class Block:
 
     def of(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... k"]:
         """The block's entries of x in SI units."""
-        return x[..., self.at] * self.unit
+        return x[..., self.at] * self.unit if self.root is None else x[..., self.at] @ self.root.mT
 
     def covariance(self, C: Float[Tensor, "... n n"]) -> Float[Tensor, "... k k"]:
         """The block's covariance in SI units, from that of x."""
-        return C[..., self.at, self.at] * self.unit * self.unit.unsqueeze(-1)
+        own = C[..., self.at, self.at]
+        return own * self.unit * self.unit.unsqueeze(-1) if self.root is None else self.root @ own @ self.root.mT
 
 
 @dataclass(frozen=True)
@@ -187,8 +190,9 @@ class Unknowns:
         tip = block("tip", wrench[: TIP_SIZE[self.tip]], TIP_STD**-2)
         tendons = 0 if self.tension_std is None else len(robot.tendons)
         tension = block("tension", [self.tension_std or 0.0] * tendons, 1.0, informative=tendons)
-        nearly = () if self.uncertainty is None else self.uncertainty.parameters(robot)
-        parameters = block("parameters", [p.std for p in nearly], 1.0, informative=len(nearly))
+        root = None if self.uncertainty is None else self.uncertainty.root(robot)
+        nearly = [] if root is None else root.diagonal().tolist()
+        parameters = block("parameters", nearly, 1.0, informative=len(nearly), root=root)
         if self.registration is None:
             registration = block("registration", [], 0.0)
         else:
