@@ -25,9 +25,10 @@ from torchrod import (
 )
 from torchrod.cli import main
 from torchrod.estimation.evaluator import NearlyKnownEvaluator, TorchEvaluator, evaluator
+from torchrod.model.uncertainty import Found
 
 S = torch.linspace(0.02, 0.4, 20)
-EVERY = Uncertainty(0.03, 0.05, 0.04, 0.1, 0.1, 0.2, 0.1, 0.05)
+EVERY = Uncertainty(0.03, 0.05, 0.04, 0.1, 0.1, 0.2, 0.1, 0.05, 0.2, 1e-3, 0.02)
 
 
 def problem_of(robot: Robot, uncertainty: Uncertainty, **unknown) -> Problem:
@@ -51,11 +52,24 @@ def test_jacobian(robot):
 def test_the_parameters_are_those_that_a_robot_has():
     passive, pulled = (tuple(p.name for p in EVERY.parameters(r())) for r in (steel_rod, busy_robot))
     bumps = [f"curvature_{axis}_{k}" for axis in "xy" for k in range(1, 6)]
-    assert set(passive) == {"stiffness", "set_x", "set_y", *bumps}
-    assert set(pulled) - set(passive) == {"mass", "gravity_1", "gravity_2", "tension_1", "tension_2", "friction_1", "friction_2"}
+    assert set(passive) == {
+        "stiffness",
+        "set_x",
+        "set_y",
+        *bumps,
+        *(f"metric_{axes}" for axes in ("xx", "yy", "zz", "yz", "xz", "xy")),
+    }
+    of_tendons = {f"{k}_{j}" for k in ("tension", "tension_offset", "friction", "tendon_x", "tendon_y") for j in (1, 2)}
+    assert set(pulled) - set(passive) == {"mass", "gravity_1", "gravity_2", *of_tendons}
 
 
-@pytest.mark.parametrize("name", ["stiffness", "mass", "tension_1", "friction_2", "gravity_1", "set_y", "curvature_x_2"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("stiffness", "mass", "tension_1", "friction_2", "gravity_1", "set_y", "curvature_x_2", "tension_offset_2", "tendon_x_1"),
+        "metric_xz",
+    ],
+)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_one_standard_deviation_is_a_robot_that_is_off_by_it(name, sign):
     """h at theta = +-1 is h of the changed robot, by numbers written here."""
@@ -84,9 +98,13 @@ def test_one_standard_deviation_is_a_robot_that_is_off_by_it(name, sign):
         change = sign * math.sin(0.05) * 9.81
         options = [turned + T([0.0, change, 0.0]), turned + T([0.0, 0.0, change])]
         options += [turned - T([0.0, change, 0.0]), turned - T([0.0, 0.0, change])]
+    elif name == "tension_offset_2":
+        tension = tension + T([0.0, 0.2 * sign])
+    elif name == "tendon_x_1":
+        tendons[0] = replace(tendons[0], routing=tuple((s, x + 1e-3 * sign, y) for s, x, y in tendons[0].routing))
     elif name == "set_y":
         rod = replace(rod, reference_curvature=rod.reference_curvature + T([[0.0, 0.0, 0.1 * sign, 0.0]]))
-    else:
+    elif name == "curvature_x_2":
         rows = torch.stack([torch.linspace(0, 0.4, 5), *torch.zeros(3, 5)], -1)
         rows[1, 1] = 0.2 * sign
         rod = replace(rod, reference_curvature=rows)
@@ -95,7 +113,11 @@ def test_one_standard_deviation_is_a_robot_that_is_off_by_it(name, sign):
     def off(gravity):
         other = replace(exact, robot=replace(robot, rod=rod, gravity=gravity, tendons=Tendons(tuple(tendons))), tension=tension)
         vars(other)["state"] = exact.state
-        return other.h(plain, False)
+        h = other.h(plain, False)
+        if name == "metric_xz":
+            p = h[:, :9].unflatten(-1, (3, 3))
+            h = torch.cat([(p + 0.02 * sign * p.flip(-1) * T([1.0, 0.0, 1.0])).flatten(1), h[:, 9:]], -1)
+        return h
 
     errors = [float((problem.h(x, False) - off(g)).abs().max()) for g in options]
     assert min(errors) < 1e-6, "of grids with other nodes"
@@ -225,3 +247,55 @@ def test_the_kernel_on_every_robot_nearby_is_the_torch_model(robot, nu):
         for name in ("A", "g", "cost", "C", "r", "line"):
             ours, theirs = getattr(a, name), getattr(b, name)
             assert torch.allclose(ours, theirs, rtol=1e-9, atol=1e-9 * float(theirs.abs().max())), name
+
+
+def test_errors_that_a_calibration_leaves_go_together():
+    """x = e_k of the parameters is the robot whose errors are the k-th column of a root of the covariance."""
+    robot = busy_robot()
+    names = ("stiffness", "tension_offset_2", "frame_x", "frame_turn_z")
+    L = T([[0.03, 0, 0, 0], [0.1, 0.2, 0, 0], [1e-3, -5e-4, 5e-4, 0], [0.01, 0.0, -0.01, 0.01]])
+    stated = Uncertainty(tension_offset=0.1, found=Found(names, L @ L.T))
+    listed = stated.parameters(robot)
+    assert [p.name for p in listed] == ["tension_offset_1", "tension_offset_2", "stiffness", "frame_x", "frame_turn_z"]
+    order = [names.index(p.name) if p.name in names else -1 for p in listed]
+    total = torch.zeros(5, 5)
+    for i, a in enumerate(order):
+        for j, b in enumerate(order):
+            total[i, j] = (L @ L.T)[a, b] if min(a, b) >= 0 else 0.0
+    total[:2, :2] += 0.01 * torch.eye(2)
+    root = stated.root(robot)
+    assert torch.allclose(root @ root.T, total, rtol=1e-9)
+    problem = problem_of(robot, stated)
+    state, x = problem.state, torch.zeros(2, problem.size)
+    x[:, state.base.at] = 0.2
+    exact = problem.exact
+    plain = problem.without_parameters(x)[0]
+    for k in range(5):
+        x[:, state.parameters.at] = torch.eye(5)[k]
+        error = dict(zip((p.name for p in listed), root[:, k].tolist(), strict=True))
+        assert torch.allclose(state.parameters.of(x)[0], root[:, k])
+        rod, tendons = robot.rod, list(robot.tendons.tendons)
+        rod = replace(rod, **{K: (1 + error["stiffness"]) * getattr(rod, K) for K in ("K_se", "K_bt")})
+        tendons = [replace(t, tension_offset=error[f"tension_offset_{j + 1}"]) for j, t in enumerate(tendons)]
+        other = replace(exact, robot=replace(robot, rod=rod, tendons=Tendons(tuple(tendons))))
+        vars(other)["state"] = exact.state
+        h = other.h(plain, False)
+        c, s, p = math.cos(error["frame_turn_z"]), math.sin(error["frame_turn_z"]), h[:, :9].unflatten(-1, (3, 3))
+        p = p @ T([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T + T([error["frame_x"], 0.0, 0.0])
+        assert torch.allclose(problem.h(x, False), torch.cat([p.flatten(1), h[:, 9:]], -1), rtol=0, atol=1e-6), k
+    fast = evaluator(problem)
+    assert torch.allclose(fast.cost(x), TorchEvaluator(problem).cost(x), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("names", "covariance", "words"),
+    [
+        (("a", "a"), [[1.0, 0.0], [0.0, 1.0]], "names a parameter twice"),
+        (("a",), [[1.0, 0.0]], "one for each name"),
+        (("a", "b"), [[1.0, 0.5], [0.4, 1.0]], "symmetric"),
+        (("a", "b"), [[1.0, 2.0], [2.0, 1.0]], "negative eigenvalue"),
+    ],
+)
+def test_what_is_no_covariance_is_refused(names, covariance, words):
+    with pytest.raises(ValueError, match=words):
+        Found(names, T(covariance))

@@ -23,7 +23,7 @@ from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
 from ..model.problem import TIP_ROWS, Problem
-from ..model.uncertainty import parabola
+from ..model.uncertainty import Warp, parabola
 from ..util.by_value import Kept, key
 from . import filter as ekf
 
@@ -121,7 +121,7 @@ def kernel_serves(problem: Problem) -> bool:
     Nodes that move with a point load take along neither a section nor a curvature nor a routing that vary.
     """
     robot, family, markers = problem.robot, family_of(problem), problem.markers
-    if markers is None or not markers.isotropic or problem.state.parameters.size:
+    if markers is None or not markers.isotropic or problem.state.parameters.size or problem.warp is not None:
         return False
     if family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
@@ -298,29 +298,52 @@ class NearlyKnownEvaluator(TorchEvaluator):
         return KernelEvaluator(self.problem.exact, self.nu)
 
     @cached_property
-    def _off(self) -> list[KernelEvaluator]:
-        return [KernelEvaluator(other, self.nu) for other in self.problem.off]
+    def _off(self) -> list[tuple[KernelEvaluator, Warp | None]]:
+        """Of every robot nearby; the exact one's own where only the measurement is off."""
+        found = []
+        for other in self.problem.off:
+            plain = replace(other, warp=None)
+            vars(plain)["state"] = other.state
+            same = other.robot is self.problem.exact.robot
+            found.append((self._exact if same else KernelEvaluator(plain, self.nu), other.warp))
+        return found
 
     def take(self, index: Int[Tensor, " b"]) -> "NearlyKnownEvaluator":
         """The samples of an index."""
         part = NearlyKnownEvaluator(self.problem.take(index), self.nu)
-        vars(part)["_exact"], vars(part)["_off"] = self._exact.take(index), [other.take(index) for other in self._off]
+        exact = self._exact.take(index)
+        off = [(exact if model is self._exact else model.take(index), warp) for model, warp in self._off]
+        vars(part)["_exact"], vars(part)["_off"] = exact, off
         return part
 
     def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
         """See Problem."""
         plain, theta = self.problem.without_parameters(x)
-        return parabola(self._exact.h(plain), torch.stack([other.h(plain) for other in self._off], -1), theta)[0]
+        exact = self._exact.h(plain)
+        off = [_warped(exact if model is self._exact else model.h(plain), warp) for model, warp in self._off]
+        return parabola(exact, torch.stack(off, -1), theta)[0]
 
     def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """See Problem."""
         plain, theta = self.problem.without_parameters(x)
-        return self.problem.with_parameters(self._exact.linearized(plain), [other.linearized(plain) for other in self._off], theta)
+        exact, off = self._exact.linearized(plain), []
+        for model, warp in self._off:
+            h, H = exact if model is self._exact else model.linearized(plain)
+            off.append((_warped(h, warp), H if warp is None else _warped(H.mT, replace(warp, shift=0 * warp.shift)).mT))
+        return self.problem.with_parameters(exact, off, theta)
 
     def line(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B P 3"]:
         """The centre line (m) of the robot as the file has it."""
         plain, _ = self.problem.without_parameters(x)
         return self._exact.sums(plain).line
+
+
+def _warped(rows: Float[Tensor, "... z"], warp: Warp | None) -> Float[Tensor, "... z"]:
+    """Rows of markers, with the tip residual behind them, as they are measured."""
+    if warp is None:
+        return rows
+    p = warp(rows[..., :-TIP_ROWS].unflatten(-1, (-1, 3)))
+    return torch.cat([p.flatten(-2), rows[..., -TIP_ROWS:]], -1)
 
 
 # The kernel's tables.

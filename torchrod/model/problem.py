@@ -26,7 +26,7 @@ from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_f
 from ..util.by_value import Kept, key
 from ..util.precision import DTYPE, Float64
 from .sensors import Markers, RodState, Sensor, TipWrench
-from .uncertainty import parabola
+from .uncertainty import Warp, parabola
 from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
@@ -62,7 +62,8 @@ class Problem(Float64):
     steps: the least number of arc-length steps; 0: as many as the reference shape asks for. prior: mean and precision of x instead
     of the unknowns' own, (n) or (B, n), in the units of `state`. tip_std: standard deviations (N, N m) of a component of the tip
     residual, W^-1/2 of the paper's W on c, which then stay to the end; None: c is zero at the answer, and TIP_FORCE_STD and
-    TIP_MOMENT_STD in the rod's scales ease the way there. Errors: ValueError of `check`.
+    TIP_MOMENT_STD in the rod's scales ease the way there. warp: how positions are measured wrongly, where that is known. Errors:
+    ValueError of `check`.
     """
 
     robot: Robot
@@ -72,6 +73,7 @@ class Problem(Float64):
     steps: int = 0
     prior: tuple[Tensor, Tensor] | None = None
     tip_std: tuple[float, float] | None = None
+    warp: Warp | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -315,8 +317,8 @@ class Problem(Float64):
         """With every parameter off by a standard deviation, upwards and downwards, in turn; x in the units of the exact one."""
         exact, found = self.exact, []
         assert self.unknowns.uncertainty is not None
-        for robot in self.unknowns.uncertainty.nearby(exact.robot):
-            other = replace(exact, robot=robot)
+        for robot, warp in self.unknowns.uncertainty.nearby(exact.robot):
+            other = replace(exact, robot=robot, warp=warp)
             vars(other)["state"] = exact.state
             found.append(other)
         return found
@@ -344,6 +346,8 @@ class Problem(Float64):
         if state.registration.size:
             zeta = state.registration.of(x)
             p, q = move(zeta, p), product(exponential(zeta[..., 3:]).unsqueeze(-2), q)
+        if self.warp is not None:
+            p = self.warp(p)
         rows, first, alpha, tip = [], 0, state.base.of(x), state.tip_wrench(x)
         for sensor in self.sensors:
             at = slice(first, first + len(sensor.s))

@@ -13,11 +13,13 @@ moves all of them along a column of a root of their covariance.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..mechanics.lie import hat
 from ..mechanics.robot import Robot
 from ..mechanics.rod import Rod
 from ..mechanics.tendons import Tendon, Tendons
@@ -27,6 +29,8 @@ MOST_SHARE = 0.5  # of a number whose error is relative: with more, one standard
 KNOTS = 10  # pieces of the length over which an error of the curvature is one, where no length is stated
 RELATIVE = ("stiffness", "mass", "tension")  # errors that are shares of a number
 OF_TENDONS = ("tension", "tension_offset", "friction", "tendon_place")
+SHIFT, TURN = (tuple(f"frame_{kind}{axis}" for axis in "xyz") for kind in ("", "turn_"))  # entries of a Warp
+STRAIN = tuple(f"metric_{axes}" for axes in ("xx", "yy", "zz", "yz", "xz", "xy"))
 NONE = 1e-12  # of a standard deviation: what is left of a direction that is none
 Change = Callable[[Robot, float], Robot]
 
@@ -38,12 +42,48 @@ class Parameter:
     name: str
     unit: str
     std: float
-    change: Change
+    change: Change | None = None
+
+    @property
+    def seen(self) -> bool:
+        """Whether it is an error of what is measured, an entry of a `Warp`, and not of the robot."""
+        return self.change is None
 
     @property
     def relative(self) -> bool:
         """Whether its error is a share of a number that is positive."""
         return self.name.split("_")[0] in RELATIVE and "offset" not in self.name
+
+
+@dataclass(frozen=True)
+class Warp(Float64):
+    """How positions are measured: exp(turn) (I + E) p + shift, of p where they are, base frame.
+
+    shift (3,) m and turn (3,) rad: of the base frame. strain (6,): xx, yy, zz, yz, xz, xy of the symmetric E, by which the metric
+    of cameras is off.
+    """
+
+    shift: Float[Tensor, " 3"]
+    turn: Float[Tensor, " 3"]
+    strain: Float[Tensor, " 6"]
+
+    @classmethod
+    def of(cls, entries: dict[str, float]) -> "Warp":
+        """From errors by their names; those that are none of its own are left aside."""
+        shift, turn, strain = ([entries.get(name, 0.0) for name in names] for names in (SHIFT, TURN, STRAIN))
+        return cls(*(torch.tensor(values, dtype=DTYPE) for values in (shift, turn, strain)))
+
+    @cached_property
+    def matrix(self) -> Float[Tensor, "3 3"]:
+        """What multiplies p."""
+        xx, yy, zz, yz, xz, xy = self.strain
+        E = torch.stack([torch.stack(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
+        R = torch.linalg.matrix_exp(hat(self.turn))
+        return R @ (torch.eye(3, dtype=DTYPE) + E)
+
+    def __call__(self, p: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+        """Measured, of where they are."""
+        return p @ self.matrix.mT + self.shift
 
 
 @dataclass(frozen=True)
@@ -72,7 +112,8 @@ class Uncertainty:
     reading. friction: of every tendon's motion times mu. set: 1/m, a curvature of the whole unloaded rod, about x and about y.
     curvature: 1/m, one that changes along the rod within curvature_length (m; None: a tenth of the rod): the catch-all for discs,
     glue, tubing and backlash. gravity: rad, its direction. tension_offset: N, of every reading. tendon_place: m, of every tendon in
-    the section, along x and along y. found: what a calibration has left unknown, errors of the robot that come on top of the
+    the section, along x and along y. metric: relative, a symmetric strain of measured positions, as
+    of cameras whose scale is off. found: what a calibration has left unknown, errors of the robot that come on top of the
     others. Errors: ValueError for what is no standard deviation.
     """
 
@@ -86,6 +127,7 @@ class Uncertainty:
     gravity: float = 0.0
     tension_offset: float = 0.0
     tendon_place: float = 0.0
+    metric: float = 0.0
     found: Found | None = None
 
     def __post_init__(self):
@@ -117,6 +159,7 @@ class Uncertainty:
         if self.found is None:
             return tuple(stated.values())
         every = {p.name: p for p in self._of(robot, dict.fromkeys(KINDS, 1.0))}
+        every |= {name: Parameter(name, "m" if name in SHIFT else "rad", 1.0) for name in (*SHIFT, *TURN)}
         if missing := [name for name in self.found.names if name not in every]:
             raise ValueError(f"the robot has no {missing[0]}, which was calibrated; calibrate it again")
         names = list(dict.fromkeys([*stated, *self.found.names]))
@@ -135,15 +178,15 @@ class Uncertainty:
         C[at.unsqueeze(-1), at] += self.found.covariance - torch.diag(self.found.covariance.diagonal())
         return std.unsqueeze(-1) * torch.linalg.cholesky(_correlation(C) + NONE * torch.eye(len(C), dtype=DTYPE))
 
-    def nearby(self, robot: Robot) -> list[Robot]:
-        """Robots off by one of every unknown xi, upwards and downwards, in turn."""
+    def nearby(self, robot: Robot) -> list[tuple[Robot, Warp | None]]:
+        """Robots off by one of every unknown xi, upwards and downwards, in turn, and how they are measured."""
         listed, found = self.parameters(robot), []
         for errors in self.root(robot).mT.tolist():
             for sign in (1.0, -1.0):
-                off = robot
+                off, seen = robot, {p.name: sign * error for p, error in zip(listed, errors, strict=True) if p.seen and error}
                 for parameter, error in zip(listed, errors, strict=True):
-                    off = parameter.change(off, sign * error) if error else off
-                found.append(off)
+                    off = parameter.change(off, sign * error) if error and parameter.change is not None else off
+                found.append((off, Warp.of(seen) if seen else None))
         return found
 
     def _of(self, robot: Robot, std: dict[str, float]) -> list[Parameter]:
@@ -164,7 +207,7 @@ class Uncertainty:
             knots = self._knots(robot.rod) if std["curvature"] else []
             for k in range(len(knots)):
                 found.append(Parameter(f"curvature_{name}_{k + 1}", "1/m", std["curvature"], _curvature(axis, (knots, k))))
-        return found
+        return found + [Parameter(name, "1", std["metric"]) for name in STRAIN]
 
     def _knots(self, rod: Rod) -> list[float]:
         count = max(1, round(rod.length / (self.curvature_length or rod.length / KNOTS)))
