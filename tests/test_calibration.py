@@ -28,6 +28,7 @@ from torchrod import (
     write_shapes,
 )
 from torchrod.cli import main
+from torchrod.io import read_uncertainty
 from torchrod.mechanics.lie import rotate
 from torchrod.util.status import Status
 
@@ -291,7 +292,15 @@ def test_the_text_of_the_robot_file_is_kept(tmp_path, capsys, section, end):
     assert [t.tension_offset for t in read.tendons.tendons] == pytest.approx(
         [after[f"tension_offset_{j}"] for j in (1, 2)], rel=1e-8
     )
-    old, new = text.split(end), written.split(end)
+    body, table, found = written.partition(f"{end}[calibration]")
+    assert table
+    assert tomllib.loads(table + found)["calibration"]["parameters"] == [
+        "mass",
+        "stiffness",
+        "tension_offset_1",
+        "tension_offset_2",
+    ]
+    old, new = text.split(end), body.rstrip().split(end)
     assert len(new) == len(old) + 1  # one tension_offset was added, indented like its table
     assert sum(line.startswith("  tension_offset = ") for line in new) == 1
     assert [line.partition("#")[2] for line in new if "#" in line] == [line.partition("#")[2] for line in old if "#" in line]
@@ -394,3 +403,89 @@ def test_what_is_not_known_is_not_written(tmp_path, capsys):
     assert result["status"] == "not_converged"
     assert result["left_out"] == ["shape-3"]
     assert result["parameters"][0]["std"] is None
+
+
+def rubbing(mu: float, place: float) -> Robot:
+    tendon = replace(Tendon.straight(0.007 + place, 0.0, 0.4), friction=mu)
+    return Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), Tendons((tendon,)), SIDEWAYS)
+
+
+STATED = """name = "bench"
+[rod]
+length = 0.4
+diameter = 0.0014
+youngs_modulus = 207e9
+shear_modulus = 79e9
+mass_per_length = 0.05
+gravity = [9.81, 0.0, 0.0]
+
+[[tendons]]
+offset = [0.007, 0.0]
+
+[uncertainty]
+tension = 0.1
+
+[uncertainty.shared]
+friction = 0.2
+tendon_place_mm = 1.0
+frame = [2e-3, 0.02]
+"""
+
+
+@pytest.mark.many_fits
+def test_what_all_samples_share_is_found_beside_what_each_has_of_its_own(tmp_path, capsys):
+    """Friction, a tendon's place and the base frame, with tensions that are another from shape to shape; and the file goes on."""
+    generator, B = torch.Generator().manual_seed(3), 16
+    tension = 8 * torch.rand(B, 1, generator=generator)
+    s, truth, t = torch.linspace(0.05, 0.4, 8), rubbing(0.15, 5e-4), T([1e-3, -5e-4, 5e-4])
+    pulled = tension * (1 + 0.1 * torch.randn(B, 1, generator=generator))
+    turn = torch.linalg.matrix_exp(T([[0.0, 0.0, 0.01], [0.0, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
+    p = solve_shape(truth, (), pulled, s, B, 40).p @ turn.T + t
+    p = p + NOISE * torch.randn(p.shape, generator=generator)
+    robot, shapes = files(tmp_path, STATED, Shapes(s, p, [str(b) for b in range(B)], None, tension))
+    out, record = tmp_path / "out.toml", tmp_path / "out.json"
+    options = ["--noise", "2.5e-4", "--hold-mass", "--out", str(out), "--json", str(record)]
+    assert main(["calibrate", robot, shapes, *options]) == 0
+    found = json.loads(record.read_text())
+    expected = {"friction_1": 0.15, "tendon_x_1": 7.5e-3, "frame_x": 1e-3, "frame_y": -5e-4, "frame_z": 5e-4, "frame_turn_y": 0.01}
+    for row in found["parameters"]:
+        if row["name"] in expected:
+            assert abs(row["after"] - expected[row["name"]]) < 3 * row["std"], row
+    assert found["accepted"], found["chi2"] / found["dof"]
+    read = read_uncertainty(out)
+    assert read.calibrated is not None
+    assert float((read.calibrated.zeta[:3] - t).abs().max()) < 3e-4
+    assert read_robot(out).tendons.tendons[0].friction == pytest.approx(found["parameters"][0]["after"], rel=1e-6)
+    once_more = tmp_path / "again.toml"
+    assert (
+        main(["calibrate", str(out), shapes, "--noise", "2.5e-4", "--hold-mass", "--free", "friction", "--out", str(once_more)])
+        == 0
+    )
+    again = read_uncertainty(once_more).calibrated
+    assert again is not None
+    for name, value in read.calibrated.values.items():
+        spread = float(read.calibrated.found.covariance.diagonal()[read.calibrated.found.names.index(name)].sqrt())
+        assert abs(again.values[name] - value) < 0.3 * spread + 1e-12, name
+    capsys.readouterr()
+
+
+@pytest.mark.many_fits
+def test_a_known_weight_tells_the_stiffness(tmp_path, capsys):
+    """Without tension only the ratio of weight to stiffness shows; two shapes with a weight on the rod tell both."""
+    robot = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), gravity=SIDEWAYS)
+    s, shapes, hung = torch.linspace(0.05, 0.4, 8), [], [(0.0, 0.0), (0.4, 0.02), (0.25, 0.05)]
+    for place, kg in hung:
+        rod = replace(robot.rod, masses=T([[place, kg]])[: int(kg > 0)].reshape(-1, 2))
+        shapes.append(solve_shape(replace(robot, rod=rod), (), None, s, 1, 40).p)
+    p = torch.cat(shapes)
+    p = p + NOISE * torch.randn(p.shape, generator=torch.Generator().manual_seed(5))
+    text = STATED[: STATED.index("[[tendons]]")].replace("207e9", "180e9").replace("0.05\n", "0.04\n")
+    readings = {"hung_at": T(hung)[:, :1], "hung": T(hung)[:, 1:]}
+    path, written = files(tmp_path, text, Shapes(s, p, list("abc"), readings=readings))
+    record = tmp_path / "out.json"
+    assert main(["calibrate", path, written, "--noise", "2.5e-4", "--youngs-modulus", "--json", str(record)]) == 0
+    found = json.loads(record.read_text())
+    for row, truth in zip(found["parameters"], (0.05, 207 / 180), strict=True):
+        assert abs(row["after"] - truth) < 3 * row["std"] < 0.05 * truth, row
+    assert found["accepted"]
+    assert "without tension only the ratio" not in capsys.readouterr().err

@@ -27,13 +27,14 @@ from ..mechanics.statics import steps_of_rod
 from ..model.load_families import GaussianCoordinates, LoadFamily
 from ..model.problem import Problem
 from ..model.sensors import Markers, Sensor
-from ..model.uncertainty import KINDS, OF_TENDONS, Found, Parameter, Uncertainty
+from ..model.uncertainty import KINDS, OF_TENDONS, Change, Found, Parameter, Uncertainty
 from ..model.unknowns import Registration, Unknowns
 from ..util.precision import DTYPE
 from ..util.status import Status
 
 INNER = 100  # iterations of each fit; the settings' own count is of the steps of the parameters
 FREE = 10.0  # standard deviation of what is free, in sizes: it only keeps what does not show finite
+SOUGHT = tuple(kind for kind in KINDS if kind not in ("curvature", "curvature_length", "metric"))  # the same in all samples
 FIRST_SAG = 0.05  # where the file has no mass: the tip of the straight rod, held across gravity, sags by this part of its length
 HARDLY = 0.5  # a standard deviation above this part of a parameter's size determines nothing
 ALIKE = 0.95  # parameters so correlated cannot be told apart
@@ -56,6 +57,11 @@ class Unknown:
     std: float
     logarithmic: bool = False
     parameter: Parameter | None = None
+
+    @property
+    def change(self) -> Change | None:
+        """What an error does to the robot."""
+        return None if self.parameter is None else self.parameter.change
 
     @property
     def free(self) -> bool:
@@ -149,8 +155,8 @@ class Calibration:
         for unknown, z in zip(self.unknowns, self.z.tolist(), strict=True):
             if unknown.name == MASS and not float(robot.rod.mass_per_length):  # which the search has started from
                 robot = replace(robot, rod=replace(robot.rod, mass_per_length=torch.tensor(unknown.before, dtype=DTYPE)))
-            if unknown.parameter is not None:
-                robot = unknown.parameter.change(robot, unknown.error(z))
+            if unknown.change is not None:
+                robot = unknown.change(robot, unknown.error(z))
         return robot
 
     @property
@@ -161,9 +167,22 @@ class Calibration:
 
     @property
     def found(self) -> Found:
-        """What is left unknown of the robot's parameters."""
-        at = [i for i, unknown in enumerate(self.unknowns) if unknown.parameter is not None]
-        return Found(tuple(p.name for i in at if (p := self.unknowns[i].parameter)), self.covariance[at][:, at])
+        """What is left unknown of it."""
+        return Found(tuple(u.name if u.parameter is None else u.parameter.name for u in self.unknowns), self.covariance)
+
+    @property
+    def correlation(self) -> Float[Tensor, "n n"]:
+        """Of the unknowns."""
+        d = self.covariance.diagonal().sqrt()
+        return self.covariance / d / d.unsqueeze(-1)
+
+    def marker_offsets(self, s: Float[Tensor, " P"]) -> Float[Tensor, "n 5"]:
+        """By how much markers at s (m) are measured off: rows [s, x, y, z, std] (m) of the mean residual, and of how sure it is."""
+        count = torch.isfinite(self.residual).all(-1).sum(0)
+        mean = self.residual.nanmean(0)
+        spread = (self.residual - mean).square().nanmean((0, 2)).sqrt()
+        rows = torch.cat([s.unsqueeze(-1), mean, (spread / (count - 1).clamp(min=1).sqrt()).unsqueeze(-1)], -1)
+        return rows[count > 1]
 
 
 def calibrate(
@@ -208,7 +227,7 @@ def calibrate(
     parts = [
         replace(whole.take(index), robot=own_robot, steps=steps or steps_of_rod(robot, whole.s)) for own_robot, index in groups
     ]
-    terms = [Shared((u.size,), (u.std,), _change(u, p)) for u in sought if (p := u.parameter) is not None]
+    terms = [Shared((u.size,), (u.std,), _change(u, change)) for u in sought if (change := u.change) is not None]
     terms += [] if frame is None else [shared_frame(whole, frame)]
     try:
         found = fit_jointly(parts, terms, replace(settings, max_iterations=INNER), settings.max_iterations)
@@ -280,18 +299,17 @@ def _measure(robot: Robot, tension: Float[Tensor, "B T"] | None, parameter: Para
     return 1 / rod.length, 0.0, "1/m"  # set_x, curvature_y_3, ..
 
 
-def _change(unknown: Unknown, parameter: Parameter) -> Callable[[Problem, Tensor], Problem]:
+def _change(unknown: Unknown, change: Change) -> Callable[[Problem, Tensor], Problem]:
     """What a value of z does to a problem."""
-    return lambda problem, z: replace(problem, robot=parameter.change(problem.robot, unknown.error(float(z))))
+    return lambda problem, z: replace(problem, robot=change(problem.robot, unknown.error(float(z))))
 
 
 def _refuse_kinds(robot: Robot, kinds: Sequence[str]) -> None:
     """Raise ValueError for what the robot has not."""
     if "mass" in kinds and not bool(robot.gravity.any()):
         raise ValueError("the robot has no gravity, so its weight does not show; add gravity = [x, y, z] (m/s^2) to [rod]")
-    if unknown := [kind for kind in kinds if kind not in KINDS or kind == "curvature_length"]:
-        named = ", ".join(kind for kind in KINDS if kind != "curvature_length")
-        raise ValueError(f"there is no parameter {unknown[0]}; it must be one of {named}")
+    if unknown := [kind for kind in kinds if kind not in SOUGHT]:
+        raise ValueError(f"{unknown[0]} is nothing that is calibrated; it must be one of {', '.join((*SOUGHT, 'frame'))}")
     if not len(robot.tendons):
         for kind in kinds:
             if kind in OF_TENDONS:
@@ -353,8 +371,8 @@ def _result(
     reach, around = Z95 * torch.stack([-std_z, std_z], -1), values.unsqueeze(-1)
     interval = torch.where(log.unsqueeze(-1), around * reach.exp(), around + reach)
     hardly = [u.name for u, s in zip(sought, std_z.tolist(), strict=True) if u.free and s > HARDLY * u.size]
-    correlation = covariance / std_z / std_z.unsqueeze(-1)
-    pairs = [(i, j) for i in range(len(sought)) for j in range(i) if abs(float(correlation[i, j])) > ALIKE]
+    together = (covariance / std_z / std_z.unsqueeze(-1)).abs() > ALIKE
+    pairs = [(i, j) for i in range(len(sought)) for j in range(i) if bool(together[i, j])]
     before = torch.tensor([u.before for u in sought], dtype=DTYPE)
     if MASS in (u.name for u in sought) and not float(robot.rod.mass_per_length):
         before = before.index_fill(0, torch.tensor([[u.name for u in sought].index(MASS)]), 0.0)

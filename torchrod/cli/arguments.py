@@ -6,14 +6,26 @@ from pathlib import Path
 
 from jsonargparse import Namespace
 
+from ..io import Calibrated, Shapes
 from ..util.errors import InputError
 from ..util.files import writing
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 INPUTS = ("robot", "shapes", "result", "spec", "warm_start", "file", "layout")  # options that name files to be read,
 OUTPUTS = ("out", "plot", "json", "csv")  # and those that name files to be written
+NOISE = 1e-3  # m, of a marker's coordinate, where nothing better is known
 MOST_STEPS = 100_000  # along a rod
 COARSEST = 0.25  # of the length: with more noise no shape shows
+
+
+def as_calibrated(path: str, shapes: Shapes, calibrated: Calibrated | None) -> Shapes:
+    """Shapes in the base frame that was calibrated, and less what its markers are off. Errors: InputError."""
+    if calibrated is None:
+        return shapes
+    try:
+        return shapes.corrected(calibrated.zeta, calibrated.markers)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def positive(name: str, value: float) -> None:

@@ -2,18 +2,33 @@
 
 import tomllib
 import warnings
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import torch
 from jsonargparse import Namespace
 
-from ..analysis.calibration import STIFFNESS, Calibration
+from ..analysis.calibration import OFFSET, SOUGHT, STIFFNESS, Calibration
 from ..analysis.calibration import calibrate as run_calibration
 from ..estimation.solve import Settings
-from ..io import CALIBRATION_SUFFIXES, Shapes, read_robot, read_shapes, write_calibrated, write_calibration
+from ..io import (
+    CALIBRATION_SUFFIXES,
+    NearlyKnown,
+    Shapes,
+    calibrated_by,
+    read_robot,
+    read_shapes,
+    read_uncertainty,
+    write_calibrated,
+    write_calibration,
+)
 from ..mechanics.robot import Robot
+from ..model.load_families import GaussianCoordinates
+from ..model.unknowns import Registration
 from ..util.errors import InputError
 from ..util.status import Status
-from .arguments import noise_std, positive, writable
+from .arguments import as_calibrated, noise_std, positive, writable
 
 
 def calibrate(options: Namespace) -> None:
@@ -21,15 +36,17 @@ def calibrate(options: Namespace) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*nothing hangs")  # the mass is what is sought
         robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot, options.units)
+    nearly = read_uncertainty(options.robot)
+    shapes = as_calibrated(options.shapes, read_shapes(options.shapes, robot, options.units), nearly.calibrated)
     noise_std(options.noise)
     positive("--max-iterations", options.max_iterations)
     writable(options.out, (".toml",))
     writable(options.json, CALIBRATION_SUFFIXES)
     settings = Settings(max_iterations=options.max_iterations)
     try:
-        markers = shapes.markers(options.noise)
-        found = run_calibration(robot, markers, shapes.tension, options.youngs_modulus, options.tension_offset, settings)
+        found = run_calibration(
+            robot, shapes.markers(options.noise), shapes.tension, settings=settings, **_sought(options, robot, shapes, nearly)
+        )
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     out = [name for name, used in zip(shapes.samples, found.used.tolist(), strict=True) if not used]
@@ -42,20 +59,46 @@ def calibrate(options: Namespace) -> None:
     if options.json:
         write_calibration(options.json, found, shapes.samples, robot.name, options.noise)
     if options.out:
-        _write_robot(options, robot, found)
+        _write_robot(options, robot, found, shapes, nearly)
+
+
+def _sought(options: Namespace, robot: Robot, shapes: Shapes, nearly: NearlyKnown) -> dict[str, Any]:
+    """What is to be found, and what is known."""
+    if options.contacts < 0:
+        raise InputError(f"--contacts is {options.contacts}; it must be at least 0")
+    free = list(options.free or [])
+    shared = None if nearly.shared is None else replace(nearly.shared, **dict.fromkeys({*free} & {*SOUGHT}, 0.0))
+    frame = Registration() if "frame" in free else nearly.shared_frame
+    weight, place = shapes.readings.get("hung"), shapes.readings.get("hung_at")
+    if (weight is None) != (place is None):
+        missing = "hung_kg" if weight is None else "hung_s"
+        raise InputError(f"{options.shapes}: {missing} is missing; a known weight needs hung_s (m) and hung_kg (kg)")
+    stated = shared is not None and (shared.mass > 0 or not bool(robot.gravity.any()))
+    return {
+        "youngs_modulus": options.youngs_modulus,
+        "tension_offset": options.tension_offset,
+        "mass": not options.hold_mass and not stated,
+        "free": [kind for kind in free if kind != "frame"],
+        "shared": shared,
+        "frame": frame,
+        "own": nearly.own,
+        "hung": None if weight is None or place is None else torch.cat([place, weight], -1).nan_to_num(0.0),
+        "loads": GaussianCoordinates(options.contacts, robot.rod.length, robot.rod.force_scale) if options.contacts else None,
+    }
 
 
 def _few(names: list[str]) -> str:
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
-def _write_robot(options: Namespace, robot: Robot, found: Calibration) -> None:
+def _write_robot(options: Namespace, robot: Robot, found: Calibration, shapes: Shapes, nearly: NearlyKnown) -> None:
     """The calibrated robot file; none where the calibration has nothing to say."""
     if found.status is not Status.CONVERGED or found.undetermined:
         warnings.warn(f"{options.out}: not written, because the values are not known; see the message", stacklevel=2)
         return
-    factor = found.value(STIFFNESS, 1.0)
-    write_calibrated(options.out, options.robot, found.applied(robot), factor, options.tension_offset)
+    factor, offsets = found.value(STIFFNESS, 1.0), any(name.startswith(OFFSET) for name in found.names)
+    calibrated = calibrated_by(found, nearly.calibrated, options.noise, shapes.s, options.marker_offsets)
+    write_calibrated(options.out, options.robot, found.applied(robot), factor, offsets, calibrated)
 
 
 def _rows(found: Calibration, path: str) -> list[tuple[str, float, float, float]]:

@@ -21,7 +21,7 @@ from ..model.problem import Problem
 from ..model.unknowns import Registration, Scope, Unknowns
 from ..util.errors import InputError
 from ..util.progress import bar
-from .arguments import FIGURE_SUFFIXES, noise_or_auto, positive, writable
+from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, noise_or_auto, positive, writable
 from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 5 ms each
@@ -69,7 +69,7 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     std = options.tension_std if len(robot.tendons) else None
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
     nearly = read_uncertainty(options.robot)
-    registration = _registration(options) or nearly.frame
+    registration = _registration(options) or nearly.frame_of_a_sample
     stated = STATED * rod.length if noise is None else noise
     positive("--angle-noise", options.angle_noise)
     for value in options.base_noise or ():
@@ -79,7 +79,7 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
         positive("--curvature-noise", options.curvature_noise)
     noises = Noises(stated, options.angle_noise, base, options.curvature_noise)
     try:
-        unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.robot)
+        unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.of_a_sample)
         return Problem(robot, unknowns, shapes.sensors(noises), shapes.tension, options.steps or 0)
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
@@ -89,7 +89,10 @@ def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot, options.units)
-    noise = noise_or_auto(options.noise, robot.rod.length)
+    calibrated = read_uncertainty(options.robot).calibrated
+    shapes = as_calibrated(options.shapes, shapes, calibrated)
+    usual = calibrated.noise if calibrated is not None else None
+    noise = usual or NOISE if options.noise is None else noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)
     positive("--max-iterations", options.max_iterations)

@@ -70,7 +70,8 @@ def _estimate_parser() -> ArgumentParser:
         default="contact",
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
-    parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
+    about = "std of a marker coordinate (m); auto: from the residual; by default as calibrated, else 1e-3"
+    parser.add_argument("--noise", type=str, default=None, help=about)
     parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
     _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))
     parser.add_argument("--curvature-noise", type=float, default=None, help="std of a measured curvature kx, ky (1/m)")
@@ -107,13 +108,21 @@ def _estimate_parser() -> ArgumentParser:
 
 
 def _calibrate_parser() -> ArgumentParser:
-    parser = _Parser(description="Mass per length of a robot, from shapes that nothing but gravity and its tendons bends.")
+    about = "What a robot's file does not say well enough, from shapes that only gravity, its tendons and known weights bend."
+    parser = _Parser(description=about)
     parser.add_argument("robot", type=str, help="ROBOT.toml with gravity; its mass_per_length is the start, if positive")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz without external load, all of this robot")
     _units(parser)
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
     parser.add_argument("--youngs-modulus", action="store_true", help="also the stiffness, E and G together; needs tensions")
     parser.add_argument("--tension-offset", action="store_true", help="also one offset (N) per tendon, added to its readings")
+    about = "further kinds of which nothing is known: friction, tendon_place, set, gravity, tension, frame"
+    parser.add_argument("--free", type=str, nargs="+", action="extend", default=None, metavar="KIND", help=about)
+    parser.add_argument("--hold-mass", action="store_true", help="take the mass per length as the file has it")
+    about = "also by how much each marker is measured off, the same in all samples"
+    parser.add_argument("--marker-offsets", action="store_true", help=about)
+    about = "so many unknown loads on every shape; by default none, but for the weights that the shapes say hang there"
+    parser.add_argument("--contacts", type=int, default=0, help=about)
     parser.add_argument("--out", type=str, default=None, help="CALIBRATED.toml: ROBOT.toml with the new values, comments kept")
     parser.add_argument("--json", type=str, default=None, help="RESULT.json")
     parser.add_argument("--max-iterations", type=int, default=100, help="give up after this many")

@@ -2,9 +2,9 @@
 
 from jsonargparse import Namespace
 
-from ..io import read_fit, read_robot, read_shapes
+from ..io import read_fit, read_robot, read_shapes, read_uncertainty
 from ..util.errors import InputError
-from .arguments import FIGURE_SUFFIXES, writable
+from .arguments import FIGURE_SUFFIXES, as_calibrated, writable
 
 
 def plot(options: Namespace) -> None:
@@ -13,6 +13,7 @@ def plot(options: Namespace) -> None:
 
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot, options.units)
+    shapes = as_calibrated(options.shapes, shapes, read_uncertainty(options.robot).calibrated)
     sample = shapes.samples[0] if options.sample is None else options.sample
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")

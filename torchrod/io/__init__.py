@@ -1,22 +1,25 @@
 """Files: the robot (TOML), shapes (CSV, NPZ), results (JSON, NPZ), calibrations and what markers see (JSON)."""
 
 from .base_pose import BasePose
-from .calibration_file import CALIBRATION_SUFFIXES, write_calibration
+from .calibration_file import CALIBRATION_SUFFIXES, calibrated_by, write_calibration
 from .observability_file import write_observability, write_observability_table
 from .result_file import RESULT_SUFFIXES, read_fit, write_result
 from .robot_file import read_base_pose, read_robot
 from .robot_text import write_calibrated
 from .shape_file import read_shapes, write_shapes
 from .shapes import KINDS, Noises, Shapes
-from .uncertainty import read_uncertainty
+from .uncertainty import Calibrated, NearlyKnown, read_uncertainty
 
 __all__ = [
     "CALIBRATION_SUFFIXES",
     "KINDS",
     "RESULT_SUFFIXES",
     "BasePose",
+    "Calibrated",
+    "NearlyKnown",
     "Noises",
     "Shapes",
+    "calibrated_by",
     "read_base_pose",
     "read_fit",
     "read_robot",

@@ -19,7 +19,7 @@ from .base_pose import BasePose, as_base_pose
 from .uncertainty import uncertainty_of
 from .values import as_number, as_numbers, as_rows, as_table, in_si, read_toml
 
-TOP_KEYS = {"name", "rod", "tendons", "base", "uncertainty"}
+TOP_KEYS = {"name", "rod", "tendons", "base", "uncertainty", "calibration"}
 KINDS = {"round": ("diameter", "inner_diameter"), "oval": ("axes", "angle"), "stiffness": ("K_se", "K_bt")}  # of a section
 MODULI = ("youngs_modulus", "shear_modulus")
 SECTION_KEYS = (*KINDS["round"], *KINDS["oval"], *KINDS["stiffness"], *MODULI)
@@ -326,7 +326,7 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
     if bool(gravity.any()) and rod.mass == 0:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
     base_pose_of(path, content)
-    uncertainty_of(path, content)
+    calibrated = uncertainty_of(path, content).calibrated
     name = content.get("name", path.stem)
     if not isinstance(name, str):
         raise InputError(f"{path}: name is {shown(name)}; it must be a text in quotes")
@@ -334,4 +334,10 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
     if not isinstance(listed, list):
         raise InputError(f"{path}: tendons must be an array of tables, [[tendons]]")
     tendons = Tendons(tuple(_tendon(f"{path}: tendons[{i}]", t, rod.length) for i, t in enumerate(listed)))
-    return Robot(rod, tendons, gravity, name)
+    robot = Robot(rod, tendons, gravity, name)
+    if calibrated is None:
+        return robot
+    try:
+        return calibrated.applied(robot)
+    except ValueError as error:
+        raise InputError(f"{path}: calibration: {error}; calibrate again") from None

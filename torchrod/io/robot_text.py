@@ -17,6 +17,7 @@ from ..mechanics.robot import Robot
 from ..util.errors import InputError
 from ..util.files import put_text, reading
 from .robot_file import robot_of
+from .uncertainty import Calibrated, calibration_text
 
 HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([\w.-]+)[ \t]*\]{1,2}[ \t]*(?:#.*)?$")
 NUMBER = re.compile(r"(?<![\w.+-])[+-]?\d[\d_]*(?:\.\d[\d_]*)?(?:[eE][+-]?\d[\d_]*)?(?![\w.])")
@@ -100,6 +101,16 @@ def calibrated_text(
     return "".join(lines)
 
 
+def _with_table(text: str, table: str) -> str:
+    """The text with [calibration] at its end, and without the one that it had."""
+    lines = text.splitlines(keepends=True)
+    for section in reversed(_sections(lines, "calibration")):
+        del lines[section.start - 1 : section.stop]
+    kept = "".join(lines).rstrip()
+    end = "\r\n" if "\r\n" in kept else "\n"
+    return kept + 2 * end + table.replace("\n", end)
+
+
 def _same(a: Robot, b: Robot) -> bool:
     """Whether two robots are the same to SAME."""
 
@@ -114,8 +125,10 @@ def _same(a: Robot, b: Robot) -> bool:
     if a.rod.pieces is not None and b.rod.pieces is not None:
         rods += [(getattr(a.rod.pieces, f.name), getattr(b.rod.pieces, f.name)) for f in fields(a.rod.pieces)]
     tendons = len(a.tendons) == len(b.tendons) and all(
-        t.routing == u.routing
-        and (t.ends_at, t.friction, t.motion) == (u.ends_at, u.friction, u.motion)
+        t.ends_at == u.ends_at
+        and close(torch.tensor(t.routing), torch.tensor(u.routing))
+        and abs(t.friction * t.motion - u.friction * u.motion) <= SAME
+        and abs(t.tension_gain - u.tension_gain) <= SAME
         and abs(t.tension_offset - u.tension_offset) <= SAME * abs(t.tension_offset) + 1e-300
         for t, u in zip(a.tendons.tendons, b.tendons.tendons, strict=True)
     )
@@ -128,9 +141,11 @@ def write_calibrated(
     robot: Robot,
     stiffness_factor: float = 1.0,
     tension_offset: bool = False,
+    calibrated: Calibrated | None = None,
 ) -> None:
     """Write `source` with the calibrated values of `robot`, as a whole or not at all, once it reads back as that robot.
 
+    calibrated: [calibration], which takes the place of one that is there: what of `robot` has no place of its own in the text.
     Errors: InputError where the text cannot be edited (the file stays as it was) or the file cannot be written.
     """
     # Bytes, because reading as text would turn the line ends of another system into this one's.
@@ -140,6 +155,8 @@ def write_calibrated(
     mass = float(robot.rod.mass_per_length)
     before = float(_read(text).rod.mass_per_length) if robot.rod.pieces is not None else 0.0
     text = calibrated_text(text, mass, stiffness_factor, offsets, mass / before if before else None)
+    if calibrated is not None:
+        text = _with_table(text, calibration_text(calibrated))
     if not _reads_as(text, robot):
         tables = "[rod], [[rod.sections]] and [[tendons]]"
         raise InputError(f"{path}: not written; {source} must be plain tables, {tables} with one key = value per line")

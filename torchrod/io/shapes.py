@@ -6,15 +6,18 @@ array in an NPZ, its unit, and the sensor that takes it.
 
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..mechanics.lie import conjugate, exponential, product, unrotate
 from ..model.sensors import BaseWrench, Curvature, Markers, Poses, Sensor
 from ..util.precision import DTYPE, Float64
+
+SAME_PLACE = 1e-6  # m: markers of two files that are one
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,8 @@ class Shapes(Float64):
     in the section frame. tension: (B, T) N, readings of the load cells. time: (B,) s. readings: everything else by the name of its
     kind, (B, P, k) of places along the rod or (B, k) of the whole robot, NaN where missing: `position_std` (B, P, 1) m, the
     standard deviation of a coordinate of that position; `orientations` (B, P, 4), unit quaternions (x, y, z, w), base frame;
-    `curvature` (B, P, 2) 1/m, section frame; `base_wrench` (B, 6) N and N m, base frame.
+    `curvature` (B, P, 2) 1/m, section frame; `hung_at` (B, 1) m and `hung` (B, 1) kg, a weight that is known to hang there, for
+    torchrod calibrate; `base_wrench` (B, 6) N and N m, base frame.
     """
 
     s: Float[Tensor, " P"]
@@ -49,6 +53,25 @@ class Shapes(Float64):
             usual = noise.unsqueeze(-1) if isinstance(noise, Tensor) else noise
             noise = torch.where(torch.isfinite(stated[..., 0]), stated[..., 0], usual)
         return Markers(self.s, self.positions, noise, self.offsets)
+
+    def corrected(self, zeta: Float[Tensor, " 6"], markers: Float[Tensor, "n 5"]) -> "Shapes":
+        """As they would be measured without errors that are known: of the base frame, [m, rad], and of markers, rows
+        [s, x, y, z, std] (m). Errors: ValueError for a marker of which nothing is known, where something is of others.
+        """
+        R = exponential(zeta[3:])
+        p = unrotate(R, self.positions - zeta[:3])
+        if len(markers):
+            off = (self.s.unsqueeze(-1) - markers[:, 0]).abs()
+            if bool((off.amin(-1) > SAME_PLACE).any()):
+                s = float(self.s[off.amin(-1) > SAME_PLACE][0])
+                raise ValueError(
+                    f"the marker at s = {s:g} m was not calibrated; calibrate with it, or leave out markers in [calibration]"
+                )
+            p = p - markers[off.argmin(-1), 1:4]
+        readings = dict(self.readings)
+        if "orientations" in readings:
+            readings["orientations"] = product(conjugate(R), readings["orientations"])
+        return replace(self, positions=p, readings=readings)
 
     @property
     def groups(self) -> int:
@@ -156,5 +179,7 @@ KINDS = (
     Kind("position_std", ("sx",), Of.MARKER, True),
     Kind("orientations", ("qx", "qy", "qz", "qw"), Of.MARKER, False, _poses),
     Kind("curvature", ("kx", "ky"), Of.MARKER, False, _curvature),
+    Kind("hung_at", ("hung_s",), Of.SAMPLE, True),
+    Kind("hung", ("hung_kg",), Of.SAMPLE),
     Kind("base_wrench", ("base_fx", "base_fy", "base_fz", "base_mx", "base_my", "base_mz"), Of.SAMPLE, False, _base),
 )

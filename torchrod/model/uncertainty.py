@@ -142,13 +142,9 @@ class Uncertainty:
 
     def prepared(self, robot: Robot) -> Robot:
         """The robot with rows of its reference curvature where `curvature` bends it, so that robots compared have one grid."""
-        if not self.curvature and not self._found_along:
+        if not self.curvature:
             return robot
         return replace(robot, rod=replace(robot.rod, reference_curvature=_with_rows(robot.rod, self._knots(robot.rod))))
-
-    @property
-    def _found_along(self) -> bool:
-        return self.found is not None and any(name.startswith("curvature_") for name in self.found.names)
 
     def parameters(self, robot: Robot) -> tuple[Parameter, ...]:
         """What is unknown of a robot; that of tendons where it has some, mass and gravity where it has weight.
@@ -158,13 +154,13 @@ class Uncertainty:
         stated = {p.name: p for p in self._of(robot, {name: getattr(self, name) for name in KINDS}) if p.std}
         if self.found is None:
             return tuple(stated.values())
-        every = {p.name: p for p in self._of(robot, dict.fromkeys(KINDS, 1.0))}
-        every |= {name: Parameter(name, "m" if name in SHIFT else "rad", 1.0) for name in (*SHIFT, *TURN)}
+        every = every_parameter(robot)
         if missing := [name for name in self.found.names if name not in every]:
             raise ValueError(f"the robot has no {missing[0]}, which was calibrated; calibrate it again")
         names = list(dict.fromkeys([*stated, *self.found.names]))
         std = {name: stated[name].std if name in stated else 0.0 for name in names}
         own = dict(zip(self.found.names, self.found.covariance.diagonal().tolist(), strict=True))
+        every |= stated
         return tuple(replace(every[name], std=math.sqrt(std[name] ** 2 + own.get(name, 0.0))) for name in names)
 
     def root(self, robot: Robot) -> Float[Tensor, "k k"]:
@@ -215,6 +211,14 @@ class Uncertainty:
 
 
 KINDS = tuple(field.name for field in fields(Uncertainty) if field.name != "found")
+
+
+def every_parameter(robot: Robot) -> dict[str, Parameter]:
+    """By its name, all that can be the same in all samples, the base frame's error included; of unit standard deviations."""
+    found = Uncertainty()._of(robot, dict.fromkeys(KINDS, 1.0) | {"curvature": 0.0})
+    return {p.name: p for p in found if not p.seen} | {
+        name: Parameter(name, "m" if name in SHIFT else "rad", 1.0) for name in (*SHIFT, *TURN)
+    }
 
 
 def _correlation(C: Float[Tensor, "k k"]) -> Float[Tensor, "k k"]:
