@@ -3,12 +3,15 @@
 import math
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jsonargparse import Namespace
 
-from ..io import Calibrated, Shapes
 from ..util.errors import InputError
 from ..util.files import writing
+
+if TYPE_CHECKING:  # torchrod --help imports no torch
+    from ..io import Calibrated, Shapes
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
 INPUTS = ("robot", "shapes", "result", "spec", "warm_start", "file", "layout")  # options that name files to be read,
@@ -18,7 +21,7 @@ MOST_STEPS = 100_000  # along a rod
 COARSEST = 0.25  # of the length: with more noise no shape shows
 
 
-def as_calibrated(path: str, shapes: Shapes, calibrated: Calibrated | None) -> Shapes:
+def as_calibrated(path: str, shapes: "Shapes", calibrated: "Calibrated | None") -> "Shapes":
     """Shapes in the base frame that was calibrated, and less what its markers are off. Errors: InputError."""
     if calibrated is None:
         return shapes
