@@ -27,7 +27,7 @@ from ..model.uncertainty import Warp, parabola
 from ..util.by_value import Kept, key
 from . import filter as ekf
 
-_layouts = Kept()
+_layouts = Kept(256)  # of every robot near one whose parameters are only nearly known, on two grids
 
 
 @runtime_checkable
@@ -221,7 +221,9 @@ class KernelEvaluator:
 
     def take(self, index: Int[Tensor, " b"]) -> "KernelEvaluator":
         """The samples of an index."""
-        return KernelEvaluator(self.problem.take(index), self.nu)
+        part = KernelEvaluator(self.problem.take(index), self.nu)
+        vars(part.problem)["_layout"] = vars(self.problem).get("_layout")  # the same for all samples
+        return part
 
     @cached_property
     def _fixed(self) -> kernel.FitTables:
@@ -320,8 +322,8 @@ class NearlyKnownEvaluator(TorchEvaluator):
         """See Problem."""
         plain, theta = self.problem.without_parameters(x)
         exact = self._exact.h(plain)
-        off = [_warped(exact if model is self._exact else model.h(plain), warp) for model, warp in self._off]
-        return parabola(exact, torch.stack(off, -1), theta)[0]
+        off = (_warped(exact if model is self._exact else model.h(plain), warp) for model, warp in self._off)
+        return parabola(exact, off, theta)[0]
 
     def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """See Problem."""

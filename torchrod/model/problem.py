@@ -301,7 +301,7 @@ class Problem(Float64):
             return self._read(self.shape(x, differentiable), x)
         plain, theta = self.without_parameters(x)
         h = self.exact.h(plain, differentiable)
-        return parabola(h, torch.stack([other.h(plain, differentiable) for other in self.off], -1), theta)[0]
+        return parabola(h, (other.h(plain, differentiable) for other in self.off), theta)[0]
 
     # The robot's parameters: model.uncertainty.
 
@@ -336,9 +336,9 @@ class Problem(Float64):
     ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """h and H from those of `exact` and of every `off` at x without the parameters."""
         (h, H), at = at_zero, self.state.parameters.at.start
-        h, slopes = parabola(h, torch.stack([one for one, _ in off], -1), theta)
-        H, _ = parabola(H, torch.stack([one for _, one in off], -1), theta.unsqueeze(-2))
-        return h, torch.cat([H[..., :at], slopes, H[..., at:]], -1)
+        h, slopes = parabola(h, (one for one, _ in off), theta)
+        H, _ = parabola(H, (one for _, one in off), theta)
+        return h, torch.cat([H[..., :at], torch.stack(slopes, -1), H[..., at:]], -1)
 
     def _read(self, shape: Shape, x: Float[Tensor, "... n"]) -> Float[Tensor, "... z"]:
         """What the sensors read of a shape."""

@@ -11,7 +11,7 @@ moves all of them along a column of a root of their covariance.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -312,9 +312,13 @@ def _with_rows(rod: Rod, places: list[float]) -> Float[Tensor, "rows 4"]:
 
 
 def parabola(
-    at_zero: Float[Tensor, "... z"], off: Float[Tensor, "... z k2"], theta: Float[Tensor, "... k"]
-) -> tuple[Float[Tensor, "... z"], Float[Tensor, "... z k"]]:
-    """(1), and its derivative by theta, from the values at zero and at one standard deviation to either side, in turn."""
-    up, down, theta = off[..., ::2], off[..., 1::2], theta.unsqueeze(-2)
-    slope, curve = 0.5 * (up - down), 0.5 * (up + down) - at_zero.unsqueeze(-1)
-    return at_zero + (theta * slope + theta**2 * curve).sum(-1), slope + 2 * theta * curve
+    at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"]
+) -> tuple[Float[Tensor, "B z *m"], list[Float[Tensor, "B z *m"]]]:
+    """(1), and its derivatives by each theta, from the values at zero and at one standard deviation to either side, in turn."""
+    ends, value, slopes = iter(off), at_zero.clone(), []
+    for k, (up, down) in enumerate(zip(ends, ends, strict=True)):
+        t = theta[:, k].reshape(-1, *[1] * (at_zero.ndim - 1))
+        slope, curve = 0.5 * (up - down), 0.5 * (up + down) - at_zero
+        value.addcmul_(t, slope).addcmul_(t**2, curve)
+        slopes.append(slope.addcmul_(2 * t, curve))
+    return value, slopes
