@@ -70,6 +70,9 @@ def _estimate_parser() -> ArgumentParser:
         default="contact",
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
+    drag = "friction of the contacts: each may drag along the rod by 0 +- MU times its force"
+    parser.add_argument("--contact-friction", type=float, default=None, metavar="MU", help=drag)
+    parser.add_argument("--axial", action="store_true", help="each load may drag along the rod by any force, whatever its friction")
     parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
     parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
     _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))
@@ -149,10 +152,10 @@ def _simulate_parser() -> ArgumentParser:
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument(
         "--point",
-        nargs=3,
+        nargs="+",
         action="append",
-        metavar=("S", "FX", "FY"),
-        help="a point force at S (m) of FX FY (N, section frame); repeatable",
+        metavar=("S FX FY", "FZ"),
+        help="a point force at S (m) of FX FY, and FZ along the rod (N, section frame); repeatable",
     )
     _number_list(parser, "--tip-force", "a force at the tip (N, base frame)", 3, ("X", "Y", "Z"))
     _number_list(parser, "--tip-moment", "a moment at the tip (N m, base frame)", 3, ("X", "Y", "Z"))
