@@ -2,14 +2,14 @@
 
 The paper's steel rod, 20 markers, 1 mm noise unless said otherwise: how often the 95 % intervals and the band of the load profile
 hold the truth; what missing markers, markers that are off and an unknown noise cost; whether exchanged labels and a base frame that
-is off are told; what such a base frame costs.
+is off are told; what such a base frame costs; what contacts that drag along the rod do.
 """
 
 import argparse
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from studies.trust import coverage, frame, markers, mistakes, unknown_noise
+from studies.trust import coverage, drag, frame, markers, mistakes, unknown_noise
 
 
 def main() -> None:
@@ -19,7 +19,8 @@ def main() -> None:
         "--samples",
         type=int,
         default=1000,
-        help="runs per row; missing markers take four times as many, the base frame two fifths, the noise a fifth, mistakes a 25th",
+        help="runs per row; missing markers take four times as many, the base frame two fifths, noise and drag a fifth, mistakes a "
+        "25th",
     )
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
@@ -37,6 +38,7 @@ def main() -> None:
         unknown_noise.run(max(options.samples // 5, 4)),
         mistakes.run(max(options.samples // 25, 4)),
         frame.run(max(2 * options.samples // 5, 5), right),
+        drag.run(max(options.samples // 5, 4)),
     ):
         lines += [*part, ""]
         print("\n".join(part), flush=True)

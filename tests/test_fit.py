@@ -56,6 +56,12 @@ FAMILIES = {
     "points at known places": lambda f: PointCoordinates(2, 0.4, f, (0.13, 0.3)),
     "points": lambda f: PointCoordinates(2, 0.4, f),
 }
+DRAGGING = {
+    "gaussians": lambda f: GaussianCoordinates(2, 0.4, f, friction=0.4),
+    "gaussians at known places, free": lambda f: GaussianCoordinates(2, 0.4, f, locations=(0.1, 0.3), friction=math.inf),
+    "points": lambda f: PointCoordinates(2, 0.4, f, friction=0.4),
+    "points at known places": lambda f: PointCoordinates(2, 0.4, f, (0.13, 0.3), friction=0.4),
+}
 
 
 def close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-10) -> bool:
@@ -106,6 +112,22 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     if family == "points" and robot in ("helical tendons and gravity", "full stiffness"):
         assert not kernel_serves(problem)  # nodes that move under a curvature or a routing that varies: left to torch
         return
+    check_agreement(problem, x)
+
+
+@pytest.mark.parametrize("family", DRAGGING)
+@pytest.mark.parametrize("robot", ["passive", "straight tendons"])
+def test_loads_that_drag_along_the_rod(robot, family):
+    r = ROBOTS[robot]()
+    problem, x = case(r, DRAGGING[family](r.rod.force_scale), **FRAMES["zeta, tip wrench, tensions"])
+    last, without = problem.state.loads.size // 2, x.clone()
+    without[:, [last - 1, 2 * last - 1]] = 0.0
+    assert (problem.h(x) - problem.h(without))[:, :9].abs().nan_to_num(0.0).max() > 1e-5, "it bends the rod"
+    check_agreement(problem, x)
+
+
+def check_agreement(problem: Problem, x: torch.Tensor) -> None:
+    """h, its Jacobian and the normal equations of both evaluators, against torch.func through the whole of h."""
     evaluate, definition = evaluator(problem, nu=4.0), TorchEvaluator(problem, nu=4.0)
     assert isinstance(evaluate, KernelEvaluator)
     h, H = forward_jacobian(problem.h, x)

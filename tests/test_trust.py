@@ -2,7 +2,7 @@
 
 import pytest
 from matplotlib.figure import Figure
-from studies.trust import coverage, frame, markers, mistakes, unknown_noise
+from studies.trust import coverage, drag, frame, markers, mistakes, unknown_noise
 
 from torchrod import Estimate, estimate
 
@@ -14,6 +14,13 @@ def test_coverage_of_a_contact():
     assert min(ours[:5]) > 0.88
     assert max(linear) < min(ours[2:5])
     assert len(by) == 12
+
+
+def test_drag_that_is_stated_is_covered():
+    plain, stated = drag.measured(drag.Row(0.4, True, 1e-3), 60, 700)
+    assert max(plain[1:3]) < 0.75
+    assert min(stated[1:4]) > 0.88
+    assert stated[8] > 0.9
 
 
 def test_mistakes_are_told():

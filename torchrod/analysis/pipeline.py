@@ -39,14 +39,16 @@ def contact_hypotheses(
     contacts: int | str = "auto",
     load_prior: str = "contact",
     locations: Sequence[float] | None = None,
+    friction: float | None = None,
 ) -> list[Hypothesis]:
     """What competes to explain the readings of a problem: numbers of Gaussian loads, priors of their width, something at the tip.
 
     contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
-    against distributed. locations: known ones (m), one for each contact. With contacts "auto" an unknown tip of the problem's
-    unknowns competes with nothing at the tip, unless a sensor reads it; where none is unknown, a force there is tried on samples
-    that take two contacts or that nothing explains. The rest of its unknowns is part of every hypothesis. Errors: ValueError for
-    another prior.
+    against distributed. locations: known ones (m), one for each contact. friction: of contacts that may drag along the rod
+    (GaussianCoordinates); infinite: by any force; None: by none. With contacts "auto" an unknown tip of the problem's unknowns
+    competes with nothing at the tip, unless a sensor reads it; where none is unknown, a force there is tried on samples that take
+    two contacts or that nothing explains. The rest of its unknowns is part of every hypothesis. Errors: ValueError for another
+    prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
     counts = range(MAX_CONTACTS + 1) if contacts == "auto" else [int(contacts)]
@@ -60,11 +62,11 @@ def contact_hypotheses(
             for prior in priors if k else priors[:1]:
                 name = f"{k} {prior}" if len(priors) > 1 and k else str(k)
                 name += f" + tip {tip}" if len(tips) > 1 and tip != "none" else ""
-                loads = GaussianCoordinates(k, rod.length, rod.force_scale, prior, at)
+                loads = GaussianCoordinates(k, rod.length, rod.force_scale, prior, at, friction=friction)
                 found.append(Hypothesis(name, k, replace(known, loads=loads, tip=tip)))
     if contacts == "auto" and known.tip == "none":
         for k in range(MOST_BESIDE_TIP + 1):
-            loads = GaussianCoordinates(k, rod.length, rod.force_scale, priors[0], at)
+            loads = GaussianCoordinates(k, rod.length, rod.force_scale, priors[0], at, friction=friction)
             found.append(Hypothesis(f"{k} + tip force", k, replace(known, loads=loads, tip="force"), spare=True))
     return found
 

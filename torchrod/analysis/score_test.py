@@ -124,7 +124,5 @@ def start_with_one_more(unknowns: Unknowns, found: ScoreTest) -> Start:
     coordinates = unknowns.loads
     assert isinstance(coordinates, GaussianCoordinates)
     g = coordinates.size - coordinates.per_load
-    log_c = coordinates.start()[-1].expand(len(found.eta))
-    more = torch.cat([found.force, torch.stack([found.eta, log_c], -1)], -1)
-    x = torch.cat([found.x[:, :g], more, found.x[:, g:]], -1)
+    x = torch.cat([found.x[:, :g], coordinates.one_more(found.force, found.eta), found.x[:, g:]], -1)
     return Start.at(x, Origin.SCORE_TEST, challenged=True)

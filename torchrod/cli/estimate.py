@@ -45,6 +45,15 @@ def _count(options: Namespace, robot: Robot) -> int | str:
     return contacts if contacts == "auto" else int(contacts)
 
 
+def _friction(options: Namespace) -> float | None:
+    """Of the contacts: infinite where their force along the rod is free."""
+    if options.contact_friction is not None:
+        positive("--contact-friction", options.contact_friction)
+        if options.axial:
+            raise InputError("--contact-friction limits what --axial leaves free; give one of them")
+    return math.inf if options.axial else options.contact_friction
+
+
 def _registration(options: Namespace) -> Registration | None:
     """What is known of the base frame."""
     if options.one_frame and not options.registration:
@@ -99,7 +108,8 @@ def estimate(options: Namespace) -> None:
     writable(options.out, RESULT_SUFFIXES)
     writable(options.plot, FIGURE_SUFFIXES)
     problem = _problem(options, robot, shapes, noise)
-    candidates = contact_hypotheses(problem, _count(options, robot), options.load_prior, options.location or None)
+    count, at = _count(options, robot), options.location or None
+    candidates = contact_hypotheses(problem, count, options.load_prior, at, _friction(options))
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     sampled = options.intervals == "sampled" and bool(options.out or options.plot)  # which the table does not show
     try:
@@ -143,7 +153,7 @@ def _starts(options: Namespace, problem: Problem, candidates: list[Hypothesis]) 
     named, problems = WarmStart.read(options.warm_start), [problem.of(c.unknowns) for c in candidates]
     reasons = [named.misfit(own) for own in problems]
     if None not in reasons:
-        nearest = min(range(len(problems)), key=lambda k: abs(problems[k].state.loads.size - 4 * named.card["contacts"]))
+        nearest = min(range(len(problems)), key=lambda k: abs(candidates[k].contacts - named.card["contacts"]))
         raise InputError(f"--warm-start {options.warm_start}: {reasons[nearest]}")
     fitting = problems[reasons.index(None)]
     outside = int((~named.known(fitting, features(fitting))).sum())

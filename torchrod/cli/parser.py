@@ -70,6 +70,9 @@ def _estimate_parser() -> ArgumentParser:
         default="contact",
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
+    drag = "friction of the contacts: each may drag along the rod by 0 +- MU times its force"
+    parser.add_argument("--contact-friction", type=float, default=None, metavar="MU", help=drag)
+    parser.add_argument("--axial", action="store_true", help="each load may drag along the rod by any force, whatever its friction")
     about = "std of a marker coordinate (m); auto: from the residual; by default as calibrated, else 1e-3"
     parser.add_argument("--noise", type=str, default=None, help=about)
     parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
@@ -158,10 +161,10 @@ def _simulate_parser() -> ArgumentParser:
     parser.add_argument("robot", type=str, help="ROBOT.toml")
     parser.add_argument(
         "--point",
-        nargs=3,
+        nargs="+",
         action="append",
-        metavar=("S", "FX", "FY"),
-        help="a point force at S (m) of FX FY (N, section frame); repeatable",
+        metavar=("S FX FY", "FZ"),
+        help="a point force at S (m) of FX FY, and FZ along the rod (N, section frame); repeatable",
     )
     _number_list(parser, "--tip-force", "a force at the tip (N, base frame)", 3, ("X", "Y", "Z"))
     _number_list(parser, "--tip-moment", "a moment at the tip (N m, base frame)", 3, ("X", "Y", "Z"))

@@ -71,7 +71,7 @@ def _heaviest(options: Namespace, robot: Robot) -> str:
     L, rod = robot.rod.length, robot.rod
     sizes = {
         "rod.gravity": L * float(robot.weight.norm()),
-        **{f"--point {' '.join(row)}": math.hypot(float(row[1]), float(row[2])) for row in options.point or []},
+        **{f"--point {' '.join(row)}": math.hypot(*map(float, row[1:])) for row in options.point or []},
         f"--tip-force {_spoken(options.tip_force)}": math.hypot(*(options.tip_force or [0.0])),
         f"--tip-moment {_spoken(options.tip_moment)}": math.hypot(*(options.tip_moment or [0.0])) / L,
         f"--tension {_spoken(options.tension)}": sum(map(abs, options.tension or [])) * _reach(robot) / L,
@@ -125,17 +125,23 @@ def _displaced(
     return answer.equilibrium, reading
 
 
+def _point(row: list[float]) -> list[float]:
+    """S, FX, FY, FZ of --point, which may leave out FZ. Errors: ValueError."""
+    if not 3 <= len(row) <= 4:
+        raise ValueError(f"{len(row)} given")
+    return [*row, 0.0][:4]
+
+
 def _known_loads(options: Namespace, L: float) -> tuple[Load, ...]:
     loads: list[Load] = []
     if options.point:
         try:
-            rows = torch.tensor([[float(v) for v in row] for row in options.point], dtype=DTYPE)
+            rows = torch.tensor([_point([float(v) for v in row]) for row in options.point], dtype=DTYPE)
         except ValueError as error:
-            raise InputError(f"--point takes three numbers, S FX FY: {error}") from None
+            raise InputError(f"--point takes three numbers, S FX FY, or four, S FX FY FZ: {error}") from None
         if not bool(torch.isfinite(rows).all()) or bool(((rows[:, 0] < 0) | (rows[:, 0] > L)).any()):
             raise InputError(f"--point {options.point}: S must lie on the rod, 0 to {L} m, and the force be finite")
-        force = torch.cat([rows[:, 1:], torch.zeros_like(rows[:, :1])], -1)
-        loads.append(PointForces(force.unsqueeze(0), rows[:, 0].unsqueeze(0)))
+        loads.append(PointForces(rows[:, 1:].unsqueeze(0), rows[:, 0].unsqueeze(0)))
     if options.tip_force or options.tip_moment:
         wrench = torch.tensor([options.tip_force or [0.0] * 3, options.tip_moment or [0.0] * 3], dtype=DTYPE)
         if not bool(torch.isfinite(wrench).all()):

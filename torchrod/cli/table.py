@@ -12,6 +12,7 @@ from .screen import one_line
 MOST_LINES = 50  # on a terminal, where more would push the first away
 MOST_NOTES = 10
 HEADS = {"force (N)": 20, "F_x (N)": 10, "F_y (N)": 10, "location (mm)": 20}  # and the least width of a column
+AXIAL = {"F_z (N)": 20}  # of one more, where the force along the rod is unknown
 GAP = 2
 MOST_DECIMALS = 7  # what needs more is written with an exponent
 
@@ -33,13 +34,16 @@ def _pairs(values: list[float], spreads: list[float], usual: int) -> list[str]:
 
 
 def _cells(result: Estimate, there: list[tuple[int, int]]) -> list[list[str]]:
-    """The columns of HEADS for the loads (sample, number) that there are."""
+    """The columns of HEADS, and of AXIAL, for the loads (sample, number) that there are."""
     b, k = ([pair[i] for pair in there] for i in range(2))
     size, std = result.magnitude[b, k].tolist(), result.magnitude_std[b, k].tolist()
     place, place_std = (1e3 * result.location[b, k]).tolist(), (1e3 * result.location_std[b, k]).tolist()
     decimals = _decimals(size, std, 4)
     parts = [[_number(v, decimals) for v in result.force[b, k, i].tolist()] for i in range(2)]
-    return [_pairs(size, std, 4), *parts, _pairs(place, place_std, 1)]
+    cells = [_pairs(size, std, 4), *parts, _pairs(place, place_std, 1)]
+    if result.axial is None or result.axial_std is None:
+        return cells
+    return [*cells, _pairs(result.axial[b, k].tolist(), result.axial_std[b, k].tolist(), 4)]
 
 
 def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noise | None) -> str:
@@ -81,12 +85,12 @@ def _lines(result: Estimate, samples: list[str], noise: Noise | None) -> list[st
     """The head of the table, and the lines of the first samples."""
     force = result.force[: len(samples), :, 0].tolist()
     there = [(b, k) for b, row in enumerate(force) for k, v in enumerate(row) if not math.isnan(v)]
-    cells = _cells(result, there)
-    widths = [max([least, *(GAP + len(cell) for cell in column)]) for least, column in zip(HEADS.values(), cells, strict=True)]
+    cells, heads = _cells(result, there), HEADS | ({} if result.axial is None else AXIAL)
+    widths = [max([least, *(GAP + len(cell) for cell in column)]) for least, column in zip(heads.values(), cells, strict=True)]
     loads: dict[int, list[str]] = {}
     for (b, k), row in zip(there, zip(*cells, strict=True), strict=True):
         loads.setdefault(b, []).append(f"{k + 1:>4}" + "".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True)))
-    columns = "".join(f"{head:>{width}}" for head, width in zip(HEADS, widths, strict=True))
+    columns = "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True))
     lines = [f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{columns}{'rms (mm)':>10}"]
     accepted, status, residual = result.accepted.tolist(), result.status.tolist(), result.rms_residual.tolist()
     for b, name in enumerate(samples):

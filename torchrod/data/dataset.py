@@ -44,6 +44,7 @@ ARRAYS = {
     "gravity": ("(n, 3)", "m/s^2", "base frame"),
     "rejected": ("()", "1", "draws without an equilibrium, replaced by further ones"),
 }
+AXIAL = {"axial": ("(n, K)", "N", "force along the rod, positive towards the tip")}  # where contacts drag
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class DatasetSpec:
     Ranges are (lowest, highest). force: in force_unit, "N" or "EI/L^2" of the shard's robot. location, min_gap, width (sigma of a
     Gaussian; None for points) and markers: fractions of the rod's length. noise: m, on every coordinate. tension: N, None without
     tendons. gravity: magnitude (m/s^2) in a direction drawn anew for every sample; None leaves the robot's own.
+    contact_friction: mu of contacts that drag along the rod, each by a force drawn from N(0, (mu |F|)^2); None: none does.
     """
 
     robots: tuple[Robot, ...]
@@ -71,6 +73,12 @@ class DatasetSpec:
     markers: tuple[float, ...]
     tension: Range | None
     gravity: Range | None
+    contact_friction: float | None = None
+
+    @property
+    def arrays(self) -> dict[str, tuple[str, str, str]]:
+        """ARRAYS, and AXIAL where contacts drag."""
+        return ARRAYS if self.contact_friction is None else ARRAYS | AXIAL
 
     @property
     def shards(self) -> int:
@@ -92,6 +100,8 @@ class DatasetSpec:
     def record(self) -> dict[str, object]:
         """Plain values for JSON, the robots by content."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
+        if self.contact_friction is None:  # not recorded, so that a specification keeps its checksum from version to version
+            del plain["contact_friction"]
         return {"schema": SCHEMA, **plain, "robots": [_robot_record(robot) for robot in self.robots]}
 
     def sha256(self) -> str:
@@ -156,6 +166,8 @@ def _draw(spec: DatasetSpec, robot: Robot, rng: np.random.Generator, count: int)
         "tension": tension,
         "gravity": gravity,
     }
+    if spec.contact_friction is not None:  # drawn last: the same loads as without
+        arrays["axial"] = spec.contact_friction * size * rng.standard_normal(each)
     return {name: torch.from_numpy(value) for name, value in arrays.items()}
 
 
@@ -165,13 +177,18 @@ def drawn_load(
     location: Float[Tensor, "B K"],
     width: Float[Tensor, "B K"],
     length: float,
+    axial: Float[Tensor, "B K"] | None = None,
 ) -> Load:
     """The load family of a data set's force (N), location (m) and width (m); the force is what acts on the rod of this length (m).
 
+    axial: the forces along the rod (N).
+
     For a Gaussian a = F sqrt(c / pi) / fraction, with 2 c = 1 / width^2 and the fraction of it that lies on the rod.
     """
+    if axial is not None:
+        force = torch.cat([force, axial.unsqueeze(-1)], -1)
     if family == "point":
-        return PointForces(torch.nn.functional.pad(force, (0, 1)), location)
+        return PointForces(torch.nn.functional.pad(force, (0, 3 - force.shape[-1])), location)
     c = 0.5 / width**2
     height = (c / math.pi).sqrt() / on_rod_fraction(location, c, length)
     return GaussianLoads(force * height.unsqueeze(-1), location, c)
@@ -180,7 +197,7 @@ def drawn_load(
 def _solved(spec: DatasetSpec, robot: Robot, rng: np.random.Generator, count: int) -> dict[str, Tensor]:
     """Of `count` draws, those that have an equilibrium."""
     draw = _draw(spec, robot, rng, count)
-    load = drawn_load(spec.family, draw["force"], draw["location"], draw["width"], robot.rod.length)
+    load = drawn_load(spec.family, draw["force"], draw["location"], draw["width"], robot.rod.length, draw.get("axial"))
     tension = draw["tension"] if len(robot.tendons) else None
     shape = solve_shape(replace(robot, gravity=draw["gravity"]), (load,), tension, spec.arc_lengths(robot), count)
     solved = shape.status == int(Status.CONVERGED)
@@ -188,7 +205,7 @@ def _solved(spec: DatasetSpec, robot: Robot, rng: np.random.Generator, count: in
 
 
 def simulate_shard(spec: DatasetSpec, index: int) -> dict[str, np.ndarray]:
-    """The arrays of shard `index` by name, as in ARRAYS: float64, contiguous. A pure function of its arguments.
+    """The arrays of shard `index` by name, as in DatasetSpec.arrays: float64, contiguous. A pure function of its arguments.
 
     Draws without an equilibrium are replaced by further draws, so that the number of samples is exact.
     Errors: InputError where more than half of the draws have none.
@@ -209,13 +226,13 @@ def simulate_shard(spec: DatasetSpec, index: int) -> dict[str, np.ndarray]:
     clean = arrays["positions_clean"]
     noise = spec.noise * _stream(spec, index, 1).standard_normal(clean.shape)
     arrays |= {"s": spec.arc_lengths(robot).numpy(), "positions": clean + noise, "rejected": np.array(drawn - kept, dtype=float)}
-    return {name: np.asarray(arrays[name], order="C") for name in ARRAYS}
+    return {name: np.asarray(arrays[name], order="C") for name in spec.arrays}
 
 
 def digest(arrays: dict[str, np.ndarray]) -> str:
-    """sha256 of a shard's contents: of every array, in the order of ARRAYS, its name, type, shape and little-endian bytes."""
+    """sha256 of a shard's contents: of every array, in the order of DatasetSpec.arrays, name, type, shape, little-endian bytes."""
     sha = hashlib.sha256()
-    for name in ARRAYS:
+    for name in (n for n in ARRAYS | AXIAL if n in arrays):
         value = arrays[name]
         sha.update(f"{name} {value.dtype.newbyteorder('<').str} {value.shape}\n".encode())
         sha.update(np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<")).data)

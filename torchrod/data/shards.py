@@ -33,7 +33,7 @@ from ..mechanics.rod import Rod
 from ..mechanics.tendons import Tendon, Tendons
 from ..util.errors import InputError
 from ..util.files import put, writing
-from .dataset import ARRAYS, SCHEMA, DatasetSpec, digest
+from .dataset import SCHEMA, DatasetSpec, digest
 
 MANIFEST, CLAIM = "manifest.json", "spec.json"
 
@@ -44,7 +44,7 @@ class Dataset:
 
     s: (R, P) m. positions, positions_clean (noise-free): (N, P, 3) m, base frame. force: (N, K, 2) N on the rod, section frame.
     location, width: (N, K) m. base_wrench: (N, 6) N, N m. tension: (N, T) N. gravity: (N, 3) m/s^2, base frame.
-    digest: over the shards' checksums, in the manifest.
+    axial: (N, K) N, along the rod; None where no contact drags. digest: over the shards' checksums, in the manifest.
     """
 
     spec: DatasetSpec
@@ -59,6 +59,7 @@ class Dataset:
     base_wrench: Float[Tensor, "N 6"]
     tension: Float[Tensor, "N T"]
     gravity: Float[Tensor, "N 3"]
+    axial: Float[Tensor, "N K"] | None = None
 
 
 def shard_path(folder: Path, index: int, suffix: str = ".npz") -> Path:
@@ -85,9 +86,9 @@ def _read_json(path: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
+def _read_npz(path: Path, spec: DatasetSpec) -> dict[str, np.ndarray]:
     found = read_arrays(path)
-    return {name: found[name] for name in ARRAYS}
+    return {name: found[name] for name in spec.arrays}
 
 
 def prepare_folder(folder: Path, spec: DatasetSpec) -> None:
@@ -155,7 +156,7 @@ def has_shard(folder: Path, spec: DatasetSpec, index: int) -> bool:
     if record is None or not isinstance(record.get("torchrod"), str):
         return False
     try:
-        said = _sidecar(spec, index, _read_npz(shard_path(folder, index)))
+        said = _sidecar(spec, index, _read_npz(shard_path(folder, index), spec))
         return all(record.get(key) == value for key, value in said.items())
     except UNREADABLE:
         return False
@@ -176,7 +177,7 @@ def write_manifest(folder: Path, spec: DatasetSpec) -> str | None:
         "samples": spec.samples,
         "spec_sha256": spec.sha256(),
         "spec": spec.record(),
-        "arrays": {name: dict(zip(("shape", "unit", "meaning"), row, strict=True)) for name, row in ARRAYS.items()},
+        "arrays": {name: dict(zip(("shape", "unit", "meaning"), row, strict=True)) for name, row in spec.arrays.items()},
         "shards": [{key: r[key] for key in keys} for r in shards],
     }
     put_json(folder / MANIFEST, content)
@@ -250,7 +251,7 @@ def _place(arrays: dict[str, np.ndarray], spec: DatasetSpec, index: int, path: P
     """Copy a shard to its place among all samples."""
     remedy = "run torchrod simulate-dataset again to make it anew"
     try:
-        shard = _read_npz(path)
+        shard = _read_npz(path, spec)
     except UNREADABLE:
         raise InputError(f"{path}: is missing or damaged; {remedy}") from None
     if sha256 is not None and digest(shard) != sha256:
@@ -258,7 +259,7 @@ def _place(arrays: dict[str, np.ndarray], spec: DatasetSpec, index: int, path: P
     n, P, K, T = spec.samples_in(index), len(spec.markers), spec.contacts, len(spec.robots[0].tendons)
     sizes = {"n": n, "P": P, "K": K, "T": T}
     first = index * spec.shard_size
-    for name, (shape, _, _) in ARRAYS.items():
+    for name, (shape, _, _) in spec.arrays.items():
         expected = tuple(sizes[x] if x in sizes else int(x) for x in shape.strip("()").replace(" ", "").split(",") if x)
         if shard[name].shape != expected or shard[name].dtype != np.float64:
             raise InputError(f"{path}: array '{name}' is not float64 of shape {expected}; {remedy}")

@@ -13,7 +13,7 @@ from .dataset import DISTRIBUTIONS, FAMILIES, DatasetSpec, Range
 
 KEYS = {
     "dataset": {"samples", "shard_size", "seed", "noise"},
-    "loads": {"contacts", "family", "force", "force_scale", "distribution", "location", "min_gap", "width"},
+    "loads": {"contacts", "family", "force", "force_scale", "distribution", "location", "min_gap", "width", "contact_friction"},
     "markers": {"count", "at"},
     "robot": {"file", "robots"},
     "vary": {"tension", "gravity", "gravity_magnitude"},
@@ -78,9 +78,12 @@ def _loads(where: str, table: dict[str, Any]) -> dict[str, Any]:
     if family == "gaussian":
         width = _range(f"{where}.width", _needed(where, table, "width", "[lowest, highest] as fractions of the length"), 10.0, True)
     unit = "N" if key == "force" else "EI/L^2"
+    friction = (
+        as_number(f"{where}.contact_friction", table["contact_friction"], positive=True) if "contact_friction" in table else None
+    )
     return {
         **{"contacts": contacts, "family": family, "distribution": distribution, "force": force, "force_unit": unit},
-        **{"location": location, "min_gap": gap, "width": width},
+        **{"location": location, "min_gap": gap, "width": width, "contact_friction": friction},
     }
 
 

@@ -7,8 +7,9 @@ the places s_1 .. s_K are normal about mu with information S, and
     (1)  v = [L^T (l - mu), eta, log c],    S(eta) = L L^T,    |det dx/dv| = 1 / det L
 
 has neither the banana of a push nearer the base that looks like a weaker one farther out nor the valley of two pushes that trade.
-It only says where to draw: weights make up for what is not linear. Families of other loads are drawn in their own entries. The base
-wrench is no entry of v: equilibrium gives it.
+It only says where to draw: weights make up for what is not linear. Forces along the rod, where they are unknown, are among the
+forces, and for an entry xi that stands for one (load_families.family, along_rod) v has that force. Families of other loads are
+drawn in their own entries. The base wrench is no entry of v: equilibrium gives it.
 
 The fit needs weak priors that are normal in its own entries, of which draws must make sense where the data say little: normal with
 a deviation of 10 in eta puts nine tenths of all pushes within a tenth of the ends. Before the data, draws take a push to be
@@ -30,7 +31,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..model.load_families import GaussianCoordinates, PointCoordinates
-from ..model.load_families.family import WEAK_STD
+from ..model.load_families.family import WEAK_STD, along_rod
 from ..model.problem import TIP_ROWS, Problem
 from ..model.unknowns import TIP_STD
 from ..util.precision import DTYPE
@@ -77,14 +78,15 @@ def _cubic() -> Float[Tensor, "C J"]:
 class Response:
     """What B samples say of forces anywhere along the rod and of the entries u = [tip, tension, registration], at their fits.
 
-    gram (B, C, C, 4): H^T W H of a force at one place and one at another, row by row; cross (B, C, 2 q): with u; own (B, q, q): of
-    u, with its prior. pull (B, C, 2), pull_u (B, q): H^T W (z - h) as if there were no force and u were at the fit.
+    A force has d = 2 components, or 3. gram (B, C, C, d d): H^T W H of a force at one place and one at another, row by row; cross
+    (B, C, d q): with u; own (B, q, q): of u, with its prior. pull (B, C, d), pull_u (B, q): H^T W (z - h) as if there were no
+    force and u were at the fit.
     """
 
-    gram: Float[Tensor, "B CC 4"]
+    gram: Float[Tensor, "B CC d2"]
     cross: Float[Tensor, "B C p"]
     own: Float[Tensor, "B q q"]
-    pull: Float[Tensor, "B C 2"]
+    pull: Float[Tensor, "B C d"]
     pull_u: Float[Tensor, "B q"]
 
     def take(self, index: Int[Tensor, " b"]) -> "Response":
@@ -113,18 +115,18 @@ def _halves(mu: Float[Tensor, "..."], width: Float[Tensor, "..."]) -> Float[Tens
     return torch.stack([mean - std, mean + std], -1).clamp(0, 1)
 
 
-def _response(problem: Problem, x: Float[Tensor, "B n"], at: Float[Tensor, "B K"], force: Float[Tensor, "B K 2"]) -> Response:
+def _response(problem: Problem, x: Float[Tensor, "B n"], at: Float[Tensor, "B K"], force: Float[Tensor, "B K d"]) -> Response:
     """At the fits x, whose loads are at s / L and have these forces (in force scales): each is shared between two point forces,
     which bend the rod as it does, and then the model is linear in point forces all along the rod.
     """
-    rod, state, B = problem.robot.rod, problem.state, len(x)
-    q, J = state.base.at.start - state.loads.at.stop, 2 * PLACES
+    rod, state, B, d = problem.robot.rod, problem.state, len(x), force.shape[-1]
+    q, J = state.base.at.start - state.loads.at.stop, d * PLACES
     cell, share = _cells(at, PLACES)
     shared = (share.unsqueeze(-1) * force.unsqueeze(-2)).flatten(1, 2)
-    cells = cell.flatten(1).unsqueeze(-1).expand(-1, -1, 2)
-    there = torch.zeros(B, PLACES + 1, 2, dtype=DTYPE).scatter_add(1, cells, shared)[:, 1:].flatten(1)
+    cells = cell.flatten(1).unsqueeze(-1).expand(-1, -1, d)
+    there = torch.zeros(B, PLACES + 1, d, dtype=DTYPE).scatter_add(1, cells, shared)[:, 1:].flatten(1)
     places = tuple(rod.length * (j + 1) / PLACES for j in range(PLACES))
-    loads = PointCoordinates(PLACES, rod.length, rod.force_scale, places)
+    loads = PointCoordinates(PLACES, rod.length, rod.force_scale, places, friction=math.inf if d == 3 else None)
     wide = problem.of(replace(problem.unknowns, loads=loads))
     sums = evaluator(wide).sums(torch.cat([there, x[:, state.loads.at.stop :]], -1))
     A, pull = (v.nan_to_num(0.0) for v in ekf.TipCondition.of(sums.C, sums.r[:, -TIP_ROWS:]).reduced(sums.A[:, 0], sums.g[:, 0]))
@@ -133,9 +135,9 @@ def _response(problem: Problem, x: Float[Tensor, "B n"], at: Float[Tensor, "B K"
     mean, precision = (v[..., u].expand(B, -1) for v in (problem.mean, problem.precision))
     own, pull_u = A[:, J:, J:] + torch.diag_embed(precision), pull[:, J:] + precision * (mean - x[:, u])
     U = _cubic()
-    gram = torch.einsum("ci,bixjy,dj->bcdxy", U, A[:, :J, :J].reshape(B, PLACES, 2, PLACES, 2), U)
-    cross = torch.einsum("ci,bixq->bcxq", U, A[:, :J, J:].reshape(B, PLACES, 2, q))
-    asked = torch.einsum("ci,bix->bcx", U, pull[:, :J].reshape(B, PLACES, 2))
+    gram = torch.einsum("ci,bixjy,dj->bcdxy", U, A[:, :J, :J].reshape(B, PLACES, d, PLACES, d), U)
+    cross = torch.einsum("ci,bixq->bcxq", U, A[:, :J, J:].reshape(B, PLACES, d, q))
+    asked = torch.einsum("ci,bix->bcx", U, pull[:, :J].reshape(B, PLACES, d))
     return Response(gram.flatten(1, 2).flatten(-2), cross.flatten(-2), own, asked, pull_u)
 
 
@@ -154,8 +156,8 @@ class Chart:
         K = len(bare.places)
         if not K:
             return bare
-        gamma = x[:, problem.state.loads.at].unflatten(-1, (K, -1))
-        return cls(problem, x, _response(problem, x, torch.sigmoid(gamma[..., 2]), gamma[..., :2]))
+        force = bare._with_forces(x)[:, bare.linear[: bare.components * K]]
+        return cls(problem, x, _response(problem, x, torch.sigmoid(x[:, bare.places]), force.unflatten(-1, (K, -1))))
 
     def take(self, index: Int[Tensor, " b"]) -> "Chart":
         """The samples of an index."""
@@ -171,7 +173,7 @@ class Chart:
 
     @cached_property
     def places(self) -> list[int]:
-        """The entries that are places eta; each follows the two components of its force."""
+        """The entries that are places eta; each follows the lateral components of its force."""
         loads = self.problem.unknowns.loads
         if not isinstance(loads, GaussianCoordinates | PointCoordinates) or loads.locations is not None:
             return []
@@ -183,18 +185,58 @@ class Chart:
         places = torch.tensor(self.places, dtype=torch.int64)
         return places[self.x[:, places].argsort(dim=-1, stable=True)]
 
+    @property
+    def friction(self) -> float | None:
+        """Of the contacts, where forces along the rod are unknown."""
+        return getattr(self.problem.unknowns.loads, "friction", None)
+
+    @property
+    def components(self) -> int:
+        """Of a force that is unknown: 2, or 3."""
+        return 2 if self.friction is None else 3
+
+    @cached_property
+    def along(self) -> list[int]:
+        """The entries xi."""
+        after = getattr(self.problem.unknowns.loads, "per_load", 0) - 3
+        return [] if self.friction is None else [i + after for i in self.places]
+
     @cached_property
     def linear(self) -> Int[Tensor, " l"]:
         """The entries l: forces, then u."""
-        forces = [i - 2 + j for i in self.places for j in range(2)]
-        return torch.tensor([*forces, *range(self.problem.state.loads.at.stop, self.size)])
+        forces = [[i - 2, i - 1, *self.along[k : k + 1]] for k, i in enumerate(self.places)]
+        return torch.tensor([*(j for force in forces for j in force), *range(self.problem.state.loads.at.stop, self.size)])
+
+    def _per_xi(self, y: Float[Tensor, "... m"]) -> Float[Tensor, "... K"]:
+        """dF_z/dxi at the lateral forces of y."""
+        places = torch.tensor(self.places)
+        force = torch.stack([y[..., places - 2], y[..., places - 1]], -1)
+        return along_rod(force, torch.ones_like(force[..., 0]), self.friction or 0.0)
+
+    def _with_forces(self, y: Float[Tensor, "... m"]) -> Float[Tensor, "... m"]:
+        """y with F_z (force scales) in the place of xi."""
+        if not self.along:
+            return y
+        z = y.clone()
+        z[..., self.along] *= self._per_xi(y)
+        return z
+
+    def _with_entries(self, z: Float[Tensor, "... m"]) -> Float[Tensor, "... m"]:
+        """The inverse."""
+        if not self.along:
+            return z
+        y = z.clone()
+        y[..., self.along] /= self._per_xi(z)
+        return y
 
     def log_marginal(self, eta: Float[Tensor, "B D K"]) -> Float[Tensor, "B D"]:
         """log of how probable places of the loads are, forces integrated out to first order; but for a constant of each sample."""
         y = self.x[:, None, : self.size].expand(-1, eta.shape[1], -1).clone()
         y[..., self.places] = eta
         mu, L, gain = self._conditional(y)
-        return 0.5 * gain - L.diagonal(dim1=-2, dim2=-1).log().sum(-1) + self.log_prior(y.index_copy(-1, self.linear, mu))
+        y = self._with_entries(y.index_copy(-1, self.linear, mu))
+        turned = self._per_xi(y).log().sum(-1) if self.along else 0.0
+        return 0.5 * gain - L.diagonal(dim1=-2, dim2=-1).log().sum(-1) + self.log_prior(y) - turned
 
     def _conditional(
         self, y: Float[Tensor, "B D m"]
@@ -202,31 +244,42 @@ class Chart:
         """mu and L of (1) at the places of y or v, and by how much the forces lower the cost."""
         found = self.response
         assert found is not None
-        B, D, K, q = *y.shape[:2], len(self.places), found.own.shape[-1]
+        B, D, K, q, d = *y.shape[:2], len(self.places), found.own.shape[-1], self.components
         cell, share = self._shared(y)
         P = cell.shape[-1]
         pair = cell[:, :, :, None, :, None] * (CELLS + 1) + cell[:, :, None, :, None, :]
         by = share[:, :, :, None, :, None] * share[:, :, None, :, None, :]
-        gram = found.gram.gather(1, pair.reshape(B, -1, 1).expand(-1, -1, 4)).view(B, D, K, K, P * P, 4)
+        gram = found.gram.gather(1, pair.reshape(B, -1, 1).expand(-1, -1, d * d)).view(B, D, K, K, P * P, d * d)
         S_F = torch.einsum("bdijp,bdijpk->bdijk", by.reshape(B, D, K, K, P * P), gram)
-        S_F = S_F.view(B, D, K, K, 2, 2).transpose(3, 4).reshape(B, D, 2 * K, 2 * K)
+        S_F = S_F.view(B, D, K, K, d, d).transpose(3, 4).reshape(B, D, d * K, d * K)
         flat = cell.reshape(B, -1, 1)
-        cross = found.cross.gather(1, flat.expand(-1, -1, 2 * q)).view(B, D, K, P, 2 * q)
-        S_Fu = (share.unsqueeze(-1) * cross).sum(-2).view(B, D, 2 * K, q)
-        pull = (share.unsqueeze(-1) * found.pull.gather(1, flat.expand(-1, -1, 2)).view(B, D, K, P, 2)).sum(-2).view(B, D, 2 * K)
+        cross = found.cross.gather(1, flat.expand(-1, -1, d * q)).view(B, D, K, P, d * q)
+        S_Fu = (share.unsqueeze(-1) * cross).sum(-2).view(B, D, d * K, q)
+        pull = (share.unsqueeze(-1) * found.pull.gather(1, flat.expand(-1, -1, d)).view(B, D, K, P, d)).sum(-2).view(B, D, d * K)
         S = torch.cat([torch.cat([S_F, S_Fu], -1), torch.cat([S_Fu.mT, found.own.unsqueeze(1).expand(-1, D, -1, -1)], -1)], -2)
         asked = torch.cat([pull, found.pull_u.unsqueeze(1).expand(-1, D, -1)], -1)
-        mean, precision = (v[..., self.linear[: 2 * K]] for v in (self.problem.mean, self.problem.precision))
-        mean, precision = (v.unsqueeze(1) if v.ndim > 1 else v for v in (mean, precision))
-        S[..., : 2 * K, : 2 * K] += torch.diag_embed(precision.expand(B, D, -1))
-        asked[..., : 2 * K] += precision * mean
-        d = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
-        scaled = S / d.unsqueeze(-1) / d.unsqueeze(-2) + 1e-10 * torch.eye(S.shape[-1], dtype=DTYPE)
-        L = d.unsqueeze(-1) * torch.linalg.cholesky_ex(scaled)[0]
+        mean, precision = self._prior_of_forces
+        S[..., : d * K, : d * K] += torch.diag_embed(precision.expand(B, D, -1))
+        asked[..., : d * K] += precision * mean
+        size = S.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
+        scaled = S / size.unsqueeze(-1) / size.unsqueeze(-2) + 1e-10 * torch.eye(S.shape[-1], dtype=DTYPE)
+        L = size.unsqueeze(-1) * torch.linalg.cholesky_ex(scaled)[0]
         mu = torch.cholesky_solve(asked.unsqueeze(-1), L).squeeze(-1)
         gain = (mu * asked).sum(-1)
-        mu[..., 2 * K :] += self.x[:, None, self.linear[2 * K :]]
+        mu[..., d * K :] += self.x[:, None, self.linear[d * K :]]
         return mu, L, gain
+
+    @cached_property
+    def _prior_of_forces(self) -> tuple[Tensor, Tensor]:
+        """Mean and precision of the forces among l; of F_z at the lateral forces of the fit."""
+        at = self.linear[: self.components * len(self.places)]
+        mean, precision = (v[..., at] for v in (self.problem.mean, self.problem.precision))
+        if self.along:
+            per_xi = torch.ones(len(self.x), len(self.places), self.components, dtype=DTYPE)
+            per_xi[..., 2] = self._per_xi(self.x)
+            mean, precision = mean * per_xi.flatten(1), precision / per_xi.flatten(1) ** 2
+        mean, precision = (v.unsqueeze(1) if v.ndim > 1 else v for v in (mean, precision))
+        return mean, precision
 
     def _shared(self, y: Float[Tensor, "B D m"]) -> tuple[Int[Tensor, "B D K P"], Float[Tensor, "B D K P"]]:
         """Between which places the force of each load is shared, and how."""
@@ -241,8 +294,8 @@ class Chart:
         """v of the entries y of x."""
         if self.response is None:
             return y
-        (mu, L, _), v = self._conditional(y), y.clone()
-        v[..., self.linear] = (L.mT @ (y[..., self.linear] - mu).unsqueeze(-1)).squeeze(-1)
+        (mu, L, _), v = self._conditional(y), self._with_forces(y).clone()
+        v[..., self.linear] = (L.mT @ (v[..., self.linear] - mu).unsqueeze(-1)).squeeze(-1)
         return v
 
     def back(self, v: Float[Tensor, "B D m"]) -> tuple[Float[Tensor, "B D m"], Float[Tensor, "B D"]]:
@@ -251,7 +304,8 @@ class Chart:
             return v, v.new_zeros(v.shape[:-1])
         (mu, L, _), y = self._conditional(v), v.clone()
         y[..., self.linear] = mu + torch.linalg.solve_triangular(L.mT, v[..., self.linear].unsqueeze(-1), upper=True).squeeze(-1)
-        return y, -L.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        y, log_det = self._with_entries(y), -L.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        return y, log_det - self._per_xi(y).log().sum(-1) if self.along else log_det
 
     def slope(self, y: Float[Tensor, "B m"]) -> Float[Tensor, "B m m"]:
         """dv/dy, by central differences."""
@@ -268,6 +322,8 @@ class Chart:
             return found
         if isinstance(loads, GaussianCoordinates | PointCoordinates) and loads.force_std == WEAK_STD:
             found += [(slice(loads.per_load * k, loads.per_load * k + 2), WEAK_STD) for k in range(loads.count)]
+            if loads.friction == math.inf:
+                found += [(slice(i, i + 1), WEAK_STD) for i in self.along]
         tip = self.problem.state.tip.at
         return found + [(slice(first, first + 3), TIP_STD) for first in range(tip.start, tip.stop, 3)]
 

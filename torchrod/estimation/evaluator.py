@@ -22,6 +22,7 @@ from ..mechanics.loads import total
 from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
+from ..model.load_families.family import FAINT
 from ..model.problem import TIP_ROWS, Problem
 from ..model.uncertainty import Warp, parabola
 from ..util.by_value import Kept, key
@@ -372,6 +373,8 @@ class Layout:
 def _basis(problem: Problem, grid: Grid) -> Float[Tensor, "points g 5"]:
     """What one unit of each entry of gamma adds to [G, G2_x, G2_y] at every stage and beyond the tip, for loads linear in it."""
     family = problem.unknowns.loads
+    if isinstance(family, PointCoordinates) and family.friction is not None:
+        family = replace(family, friction=math.inf)  # the kernel puts in how F_z depends on the rest of the force
     gamma = family.start().unsqueeze(0)
 
     def integrals(gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B points5"]:
@@ -411,6 +414,8 @@ def _units(problem: Problem) -> dict[str, float]:
     return sigmoid | {
         "length": problem.robot.rod.length,
         "force_scale": getattr(loads, "force_scale", 1.0),
+        "friction": getattr(loads, "friction", None) or 0.0,
+        "faint": FAINT,
         "force_unit": unit(state.base.unit, 0),
         "moment_unit": unit(state.base.unit, 3),
         "length_unit": unit(state.registration.unit, 0),
@@ -443,11 +448,12 @@ def _layout(problem: Problem, x: Float[Tensor, "B n"] | None = None) -> Layout:
         tensors["basis"] = _basis(problem, grid)
     if family == "gaussian" and locations is not None:
         tensors["locations"] = torch.tensor(locations, dtype=s.dtype)
-    if family == "point":
-        assert x is not None
-        tensors["node"] = _nodes_of(grid.nodes, torch.sigmoid(x[:, 2 : c.size : 3]) * robot.rod.length)
     loads = {"family": kernel.FAMILIES[family], "count": getattr(c, "count", 0), "gamma": c.size}
     loads["per_load"] = c.size // max(loads["count"], 1)
+    if family == "point":
+        assert x is not None
+        tensors["node"] = _nodes_of(grid.nodes, torch.sigmoid(x[:, 2 : c.size : loads["per_load"]]) * robot.rod.length)
+    loads["axial"] = int(getattr(c, "friction", None) is not None)
     own = {
         "size": state.size,
         "tip": state.tip.size,

@@ -23,7 +23,8 @@ CHUNK = 64  # samples at a time: their draws are not kept
 class Intervals:
     """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1).
 
-    magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame. resultant (B, 4, 2) N: of the
+    magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
+    along the rod, or None. resultant (B, 4, 2) N: of the
     three components, in the base frame, and the size of all loads on the rod together, without weight and tip. tip (B, 6, 2) [N,
     N m]: the unknown wrench at the tip, or None. band (B, S, 3, 2) N/m: of f_x, f_y and |f| at evenly spaced places from base to
     tip, or None for point loads. k_hat, ess, method (B,): see Draws.
@@ -32,6 +33,7 @@ class Intervals:
     magnitude: Float[Tensor, "B K 2"]
     location: Float[Tensor, "B K 2"]
     force: Float[Tensor, "B K 2 2"]
+    axial: Float[Tensor, "B K 2"] | None
     resultant: Float[Tensor, "B 4 2"]
     tip: Float[Tensor, "B 6 2"] | None
     band: Float[Tensor, "B S 3 2"] | None
@@ -66,15 +68,17 @@ def intervals(draws: Draws) -> Intervals:
     gamma = x[..., state.loads.at]
     report, R = family.describe(gamma), resultant(problem, x)
     values = [report.force.norm(dim=-1), report.location, report.force.flatten(-2), R, R.norm(dim=-1, keepdim=True)]
+    values += [x.new_zeros(*x.shape[:-1], 0) if report.axial is None else report.axial]
     if state.tip.size:
         values.append(state.tip_wrench(x))
-    K = report.location.shape[-1]
-    found = quantiles(torch.cat(values, -1), weight)
-    size, place, force, whole, tip = found.split([K, K, 2 * K, 4, found.shape[1] - 4 * K - 4], 1)
+    parts = quantiles(torch.cat(values, -1), weight).split([v.shape[-1] for v in values], 1)
+    size, place, force, axial, tip, K = *parts[:3], parts[5], parts[-1], report.location.shape[-1]
+    whole = torch.cat(parts[3:5], 1)
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
     band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
     numbers = draws.k_hat, draws.ess, draws.method
-    made = Intervals(size, place, force.unflatten(1, (K, 2)), whole, tip if state.tip.size else None, band, *numbers)
+    drag = None if report.axial is None else axial
+    made = Intervals(size, place, force.unflatten(1, (K, 2)), drag, whole, tip if state.tip.size else None, band, *numbers)
     return _masked(made, draws.k_hat <= 1)
 
 
@@ -84,7 +88,7 @@ def _masked(made: Intervals, sound: Tensor) -> Intervals:
     def only(v: Tensor | None) -> Tensor | None:
         return v if v is None else torch.where(sound.reshape(-1, *[1] * (v.ndim - 1)), v, torch.nan)
 
-    names = ("magnitude", "location", "force", "resultant", "tip", "band")
+    names = ("magnitude", "location", "force", "axial", "resultant", "tip", "band")
     return replace(made, **{name: only(getattr(made, name)) for name in names})
 
 
@@ -106,6 +110,7 @@ def sampled_intervals(
     shapes = {"magnitude": (K, 2), "location": (K, 2), "force": (K, 2, 2), "resultant": (4, 2), "k_hat": (), "ess": ()}
     for name, shape in shapes.items():
         whole[name] = torch.full((B, *shape), torch.nan, dtype=DTYPE)
+    whole["axial"] = None if estimate.axial is None else torch.full((B, K, 2), torch.nan, dtype=DTYPE)
     whole["tip"] = None if estimate.tip is None else torch.full((B, 6, 2), torch.nan, dtype=DTYPE)
     whole["band"], whole["method"] = torch.full((B, NODES, 3, 2), torch.nan, dtype=DTYPE), torch.zeros(B, dtype=torch.int64)
     for unknowns, index in parts:

@@ -22,7 +22,8 @@ CHUNK = 256  # samples at a time
 class LoadPlaces:
     """Of up to K loads on B samples, in the robot's own base frame; NaN where there is no load.
 
-    position: (B, K, 3) m, p(S), of the centre line at the load's location. force: (B, K, 3) N, R(S) [F_x, F_y, 0].
+    position: (B, K, 3) m, p(S), of the centre line at the load's location. force: (B, K, 3) N,
+    R(S) [F_x, F_y, F_z], F_z = 0 unless it is unknown.
     """
 
     position: Float[Tensor, "B K 3"]
@@ -53,7 +54,8 @@ def load_places(problem: Problem, parts: Sequence[tuple[Unknowns, Int[Tensor, " 
             there = torch.isfinite(at)
             at = at.nan_to_num(0.0)
             q = normalized(_cubic(shape.q, at))
-            pushed = torch.nn.functional.pad(fit.force[some], (0, 1))
+            axial = torch.zeros_like(fit.location[some]) if fit.axial is None else fit.axial[some]
+            pushed = torch.cat([fit.force[some], axial.unsqueeze(-1)], -1)
             position[some] = torch.where(there.unsqueeze(-1), _cubic(shape.p, at), torch.nan)
             force[some] = torch.where(there.unsqueeze(-1), rotate(q, pushed), torch.nan)
     return LoadPlaces(position, force)

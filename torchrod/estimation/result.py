@@ -31,7 +31,8 @@ class FittedRod:
     """What a figure needs of one sample: force (K, 2) N (section frame), location (K,) m, width (K,) m (0: a point force), base
     wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, the unknown
     force (3,) N at the tip in the base frame, or None, the 95 % intervals (K, 2) m of the locations, NaN where they are not
-    known, and the load profile with its band; both None where only the shape is to be drawn.
+    known, and the load profile with its band; both None where only the shape is to be drawn. axial (K,) N: the forces along the
+    rod, or None.
     """
 
     force: Float[Tensor, "K 2"]
@@ -42,14 +43,21 @@ class FittedRod:
     tip_force: Float[Tensor, " 3"] | None = None
     location_interval: Float[Tensor, "K 2"] | None = None
     profile: Profile | None = None
+    axial: Float[Tensor, " K"] | None = None
+
+    @property
+    def pushes(self) -> Float[Tensor, "K 3"]:
+        """The forces with what is along the rod (N, section frame)."""
+        axial = torch.zeros_like(self.location) if self.axial is None else self.axial
+        return torch.cat([self.force, axial.unsqueeze(-1)], -1)
 
     def loads(self, length: float) -> tuple[Load, ...]:
         """The loads as mechanics.loads has them."""
         point = self.width <= 0
         c = 0.5 / self.width[~point] ** 2
         spread = (math.pi / c).sqrt() * on_rod_fraction(self.location[~point], c, length)
-        force = torch.cat([self.force, torch.zeros_like(self.force[:, :1])], -1)
-        smooth = GaussianLoads(self.force[~point] / spread.unsqueeze(-1), self.location[~point], c)
+        force = self.pushes
+        smooth = GaussianLoads(force[~point] / spread.unsqueeze(-1), self.location[~point], c)
         return (smooth, PointForces(force[point], self.location[point]))
 
 
@@ -96,6 +104,8 @@ class Estimate:
     covariance, the residual and the centre line are of, by less than what 1e-3 of chi^2 can tell; cost and chi2 are foretold for x.
     force (B, K, 2) N, location (B, K) m, width (B, K) m, and the covariance (B, K, 4, 4) of [F_x, F_y, location, width].
     net_force (B, K, 2): the paper's (13), which counts the part of a Gaussian beyond the tip; `force` is what the rod feels.
+    axial, axial_std (B, K) N: the forces along the rod, positive towards the tip, None where loads are normal to the rod; neither
+    `force` nor `magnitude` counts them.
     tip (B, 6) [N, N m] and tip_covariance (B, 6, 6): the unknown dead wrench at the tip, base frame, zero in the entries that are
     not unknown; None without Unknowns.tip. base_wrench (B, 6) [N, N m] and registration (B, 6) [m, rad] or None. centre_line
     (B, P, 3) m: the fitted rod at the sensors' arc lengths, in the base frame. residual (B, K, 3) m: of all rows that are positions
@@ -117,6 +127,8 @@ class Estimate:
     width: Float[Tensor, "B K"]
     load_covariance: Float[Tensor, "B K 4 4"]
     net_force: Float[Tensor, "B K 2"]
+    axial: Float[Tensor, "B K"] | None
+    axial_std: Float[Tensor, "B K"] | None
     tip: Float[Tensor, "B 6"] | None
     tip_covariance: Float[Tensor, "B 6 6"] | None
     base_wrench: Float[Tensor, "B 6"]
@@ -149,7 +161,7 @@ class Estimate:
 
     @property
     def magnitude(self) -> Float[Tensor, "B K"]:
-        """|F| (N)."""
+        """|F| (N), normal to the rod."""
         return self.force.norm(dim=-1)
 
     @property
@@ -238,7 +250,8 @@ class Estimate:
         tip = None if self.tip is None or bool(self.tip[sample].isnan().all()) else self.tip[sample, :3]
         loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
         interval, along = self.location_interval[sample][there], None if profile is None else profile.of(sample)
-        return FittedRod(*loads, self.base_wrench[sample], zeta, tip, interval, along)
+        axial = None if self.axial is None else self.axial[sample][there]
+        return FittedRod(*loads, self.base_wrench[sample], zeta, tip, interval, along, axial)
 
     def improved_by(self, other: "Estimate", index: Int[Tensor, " b"]) -> "Estimate":
         """With the samples of `index` replaced by those of another attempt where that is better; every attempt is counted.
@@ -321,8 +334,9 @@ def load_covariance(c: LoadFamily, gamma: Float[Tensor, "B g"], C: Float[Tensor,
     if isinstance(c, GaussianCoordinates) and c.size:  # a fifth of the time of a single frame
         slope = c.report_slope(gamma)
         own = C.unflatten(2, (c.count, -1)).unflatten(1, (c.count, -1)).diagonal(dim1=1, dim2=3).movedim(-1, 1)
-        if c.per_load == 3:
-            own = own[..., [0, 1, 2, 2], :][..., [0, 1, 2, 2]]  # any entry in the location's place
+        if c.per_load != 4 or c.locations is not None:  # any entry in a known location's place; xi is the last
+            kept = [0, 1, 2, 2 if c.locations is not None else 3]
+            own = own[..., kept, :][..., kept]
         return own * (slope.unsqueeze(-1) * slope.unsqueeze(-2))
 
     def described(gamma: Float[Tensor, "... g"]) -> Float[Tensor, "... k4"]:
@@ -332,6 +346,20 @@ def load_covariance(c: LoadFamily, gamma: Float[Tensor, "B g"], C: Float[Tensor,
     _, J = pointwise_jacobian(described, gamma)
     J = J.unflatten(1, (-1, 4))
     return J @ C.unsqueeze(1) @ J.transpose(-1, -2)
+
+
+def axial_std(c: LoadFamily, gamma: Float[Tensor, "B g"], C: Float[Tensor, "B g g"]) -> Float[Tensor, "B K"] | None:
+    """Standard deviation (N) of each force along the rod, carried over likewise; None where there is none."""
+    if c.describe(gamma).axial is None:
+        return None
+
+    def axial(gamma: Float[Tensor, "... g"]) -> Float[Tensor, "... K"]:
+        found = c.describe(gamma).axial
+        assert found is not None
+        return found
+
+    _, J = pointwise_jacobian(axial, gamma)
+    return (J @ C @ J.mT).diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
 
 
 def _only(mask: Bool[Tensor, "..."]) -> Callable[[Tensor], Tensor]:
@@ -370,15 +398,18 @@ def make_estimate(
     rows = sums.r[:, :-TIP_ROWS]
     tip, free = state.tip.size, state.tension.size
     variance, of_parameters = (b.covariance(covariance).diagonal(dim1=-2, dim2=-1) for b in (state.tension, state.parameters))
-    pad = torch.nn.functional.pad
+    of_loads, pad = covariance[:, state.loads.at, state.loads.at], torch.nn.functional.pad
+    drag = axial_std(family, gamma, of_loads)
     return Estimate(
         x=kept(x),
         covariance=settled(covariance),
         force=kept(report.force),
         location=kept(report.location),
         width=kept(report.width),
-        load_covariance=settled(load_covariance(family, gamma, covariance[:, state.loads.at, state.loads.at])),
+        load_covariance=settled(load_covariance(family, gamma, of_loads)),
         net_force=kept(report.net_force),
+        axial=None if report.axial is None else kept(report.axial),
+        axial_std=None if drag is None else settled(drag),
         tip=kept(state.tip_wrench(x)) if tip else None,
         tip_covariance=settled(pad(state.tip.covariance(covariance), (0, 6 - tip, 0, 6 - tip))) if tip else None,
         base_wrench=kept(state.base.of(x)),

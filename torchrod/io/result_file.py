@@ -39,6 +39,7 @@ COLUMNS = (
     *("force", "net_force", "magnitude", "magnitude_std", "magnitude_interval", "location", "location_std", "location_interval"),
     *("width", "magnitude_location_covariance", "rms_residual", "status", "accepted", "iterations", "restarts", "warm_started"),
     *("chi2", "dof", "base_wrench", "tip", "registration", "tension", "tension_std", "parameters", "parameters_std"),
+    *("axial", "axial_std"),
 )
 Columns = dict[str, list[Any]]
 WITH_UNITS = {
@@ -48,9 +49,12 @@ WITH_UNITS = {
     "location_m": "location",
     "location_std_m": "location_std",
     "width_m": "width",
+    "force_axial_N": "axial",
+    "force_axial_std_N": "axial_std",
     "rms_residual_m": "rms_residual",
 }
-LOAD_NUMBERS = {name: field for name, field in WITH_UNITS.items() if name not in ("force_local_N", "rms_residual_m")}
+AXIAL = ("force_axial_N", "force_axial_std_N")  # only where the force along the rod is unknown
+LOAD_NUMBERS = {name: field for name, field in WITH_UNITS.items() if name not in ("force_local_N", "rms_residual_m", *AXIAL)}
 
 
 # Of each load, with the units in their names: in RESULT.json, as columns of LOADS.csv and as arrays of RESULT.npz.
@@ -89,7 +93,7 @@ def _columns(estimate: Estimate, space: dict[str, Tensor], drawn: Intervals | No
     if drawn is not None:
         found |= {f"{name}_interval": _merged(estimate, drawn, name) for name in ("magnitude", "location")}
         found |= {"drawn_force": drawn.force, "resultant": drawn.resultant, "k_hat": drawn.k_hat, "ess": drawn.ess}
-        found |= {"method": drawn.method, "tip_interval": drawn.tip}
+        found |= {"method": drawn.method, "tip_interval": drawn.tip, "axial_interval": drawn.axial}
     if estimate.tip_covariance is not None:
         found["tip_std"] = estimate.tip_covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
     if bool(estimate.outlier.any()):
@@ -105,19 +109,27 @@ def _numbers(value: object) -> str:
     return text
 
 
+def _axial(of: Columns, b: int, k: int, name: str) -> dict[str, object]:
+    """The entry of the force along the rod, where that is unknown."""
+    return {"force_axial_N": of[name][b][k]} if name in of else {}
+
+
 def _loads(of: Columns, b: int) -> list[dict[str, object]]:
     return [
         {
             "force_local_N": force,
+            **_axial(of, b, k, "axial"),
             "magnitude_N": of["magnitude"][b][k],
             "location_m": of["location"][b][k],
             "width_m": of["width"][b][k],
             **{name: of[name][b][k] for name in SPACE if name in of},
             "net_force_local_N": of["net_force"][b][k],
             "covariance": of["magnitude_location_covariance"][b][k],
-            "std": {"magnitude_N": of["magnitude_std"][b][k], "location_m": of["location_std"][b][k]},
+            "std": {"magnitude_N": of["magnitude_std"][b][k], "location_m": of["location_std"][b][k]}
+            | _axial(of, b, k, "axial_std"),
             "interval_95": {"magnitude_N": of["magnitude_interval"][b][k], "location_m": of["location_interval"][b][k]}
-            | ({"force_local_N": of["drawn_force"][b][k]} if "drawn_force" in of else {}),
+            | ({"force_local_N": of["drawn_force"][b][k]} if "drawn_force" in of else {})
+            | _axial(of, b, k, "axial_interval"),
         }
         for k, force in enumerate(of["force"][b])
         if not math.isnan(force[0])
@@ -242,7 +254,8 @@ def _load_table(estimate: Estimate, samples: list[str], space: dict[str, Tensor]
     of = _columns(estimate, space, None)
     vectors = {"force_local_N": "force", **{name: name for name in SPACE if name in of}}
     parts = {name: "xyz"[: 2 if name == "force_local_N" else 3] for name in vectors}
-    header = ["time_s", "sample", "status", "accepted", "load", *LOAD_NUMBERS]
+    single = LOAD_NUMBERS | {name: WITH_UNITS[name] for name in AXIAL if WITH_UNITS[name] in of}
+    header = ["time_s", "sample", "status", "accepted", "load", *single]
     header += [f"{name.rpartition('_')[0]}_{axis}_{name.rpartition('_')[2]}" for name, axes in parts.items() for axis in axes]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -251,7 +264,7 @@ def _load_table(estimate: Estimate, samples: list[str], space: dict[str, Tensor]
         head = ["" if time is None else float(time[b]), name, Status(of["status"][b]).label, int(of["accepted"][b])]
         loads = [k for k, v in enumerate(of["location"][b]) if not math.isnan(v)]
         for k in loads:
-            numbers = [of[field][b][k] for field in LOAD_NUMBERS.values()]
+            numbers = [of[field][b][k] for field in single.values()]
             numbers += [v for field in vectors.values() for v in of[field][b][k]]
             writer.writerow([*head, k + 1, *("" if math.isnan(v) else v for v in numbers)])
         tip = {f"force_base_{axis}_N": v for axis, v in zip("xyz", of["tip"][b], strict=False)} if "tip" in of else {}
@@ -321,6 +334,7 @@ def write_result(
     arrays |= {f"{name}_interval": _merged(estimate, intervals, name) for name in ("magnitude", "location")}
     if intervals is not None:
         arrays |= {"force_interval": intervals.force, "resultant_interval": intervals.resultant, "tip_interval": intervals.tip}
+        arrays["axial_interval"] = intervals.axial
         arrays |= {"k_hat": intervals.k_hat, "ess": intervals.ess, "draws_method": intervals.method}
     if noise is not None:
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
@@ -384,6 +398,7 @@ def _arrays_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]
         values["registration"] = file["registration"][b] if "registration" in file else None
         values["tip"] = _there(file["tip"][b][:3].tolist()) if "tip" in file else None
         values["interval"] = file["location_interval"][b] if "location_interval" in file else None
+        values["axial"] = file["axial"][b] if "axial" in file else None
         if "profile_f" not in file:
             return values, None
         return values, {"s": file["profile_s"], "f": file["profile_f"][b], "band": file["profile_band"][b]}
@@ -403,6 +418,7 @@ def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]
     values["registration"] = None if twist is None else [*twist["translation_m"], *twist["rotation_rad"]]
     values["tip"] = _there(record["tip"]["force_N"]) if "tip" in record else None
     values["interval"] = [load["interval_95"]["location_m"] for load in loads]
+    values["axial"] = [load["force_axial_N"] for load in loads] if any("force_axial_N" in load for load in loads) else None
     profile = record.get("profile")
     if profile is None:
         return values, None
@@ -426,7 +442,7 @@ def _fit_of(values: Values, stored: Values | None) -> FittedRod:
     K = len(values["location"])  # pyright: ignore[reportArgumentType]
     force, location, width = _tensor(values, "force", K, 2), _tensor(values, "location", K), _tensor(values, "width", K)
     wrench, zeta, tip = (_tensor(values, name, n) for name, n in (("base_wrench", 6), ("registration", 6), ("tip", 3)))
-    interval, profile = _tensor(values, "interval", K, 2), None
+    interval, axial, profile = _tensor(values, "interval", K, 2), _tensor(values, "axial", K), None
     if force is None or location is None or width is None or wrench is None:
         raise ValueError("its loads are null")
     if stored is not None:
@@ -436,8 +452,8 @@ def _fit_of(values: Values, stored: Values | None) -> FittedRod:
             raise ValueError("its profile has no numbers")
         profile = Profile(s, f, band)
     there = torch.isfinite(force).all(-1)
-    interval = None if interval is None else interval[there]
-    return FittedRod(force[there], location[there], width[there], wrench, zeta, tip, interval, profile)
+    interval, axial = (None if value is None else value[there] for value in (interval, axial))
+    return FittedRod(force[there], location[there], width[there], wrench, zeta, tip, interval, profile, axial)
 
 
 def read_fit(
@@ -463,7 +479,7 @@ def _read_fit(asked: _Asked, opened: IO[bytes]) -> FittedRod:
         raise
     except UNREADABLE as error:
         raise InputError(f"{asked.path}: is not a result of torchrod estimate ({why(error)}); write it with --out") from None
-    numbers = [fit.force, fit.location, fit.width, fit.base_wrench, fit.registration, fit.tip_force]
+    numbers = [fit.force, fit.location, fit.width, fit.base_wrench, fit.registration, fit.tip_force, fit.axial]
     if not all(bool(torch.isfinite(t).all()) for t in numbers if t is not None) or bool((fit.width < 0).any()):
         raise InputError(f"{asked.path}: sample {asked.sample} has no fit to draw; see its message")
     asked.check_places(fit)

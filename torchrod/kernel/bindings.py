@@ -55,8 +55,8 @@ class CLoads(ctypes.Structure):
     """The family of the loads, and what it knows beforehand."""
 
     _fields_ = [
-        *((n, _I) for n in ("family", "count", "per_load", "size")),
-        *((n, _D) for n in ("length", "force_scale", "eps", "beta1", "beta2")),
+        *((n, _I) for n in ("family", "count", "per_load", "size", "axial")),
+        *((n, _D) for n in ("length", "force_scale", "eps", "beta1", "beta2", "friction", "faint")),
         *((n, _P) for n in ("locations", "basis")),
         *((n, CTable) for n in ("s", "inside")),
         ("node", CPlaces),

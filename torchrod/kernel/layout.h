@@ -41,8 +41,8 @@ inline std::string structures_and_constants() {
     BEGIN(Known) F(steps), F(tendons), F(newton), F(diagonal), F(varying), F(K_se), F(K_bt), F(K_se_inverse), F(K_bt_inverse), F(h), F(Gm), F(Wn),
         F(Wm), F(u_star), F(L), F(dr), F(tau), F(ddr),
         F(friction), F(at), F(outputs) END
-    BEGIN(Loads) F(family), F(count), F(per_load), F(size), F(length), F(force_scale), F(eps), F(beta1), F(beta2), F(locations), F(basis), F(s), F(inside),
-        F(node) END
+    BEGIN(Loads) F(family), F(count), F(per_load), F(size), F(axial), F(length), F(force_scale), F(eps), F(beta1), F(beta2), F(friction), F(faint), F(locations),
+        F(basis), F(s), F(inside), F(node) END
     BEGIN(Task) F(known), F(loads), F(size), F(tip), F(tensions), F(registration), F(force_unit), F(moment_unit), F(length_unit),
         F(angle_unit), F(tension_unit), F(robust), F(offsets), F(active), F(weight), F(positions), F(w) END
     BEGIN(Filter) F(mean), F(precision), F(Q), F(step), F(decrement), F(share), F(settled), F(gain), F(exact), F(x), F(Sigma), F(before), F(cap), F(reach), F(Sigma0),

@@ -7,8 +7,10 @@ enum Family : int64_t { NONE = 0, GAUSSIAN = 1, PAPER = 2, POINT = 3, LINEAR = 4
 
 struct Loads {
     int64_t family, count, per_load, size;  // size: entries of gamma
+    int64_t axial;             // whether the last entry of every load is its force along the rod
     double length, force_scale;
     double eps, beta1, beta2;  // PAPER: of its sigmoid
+    double friction, faint;    // along_rod
     const double* locations;  // (count) m where they are known, else null
     const double* basis;      // LINEAR: (3 S + 1, size, PARTS), what one unit of each entry of gamma adds
     Table s;                  // (3 S) m, the stages
@@ -62,11 +64,23 @@ INLINE Centre algebraic_centre(const Loads& l, V eta) {  // coordinates/paper.py
     return {half * eta * r + middle, half * l.eps * r / square};
 }
 
+// The force of one load along the rod (force scales), and how it moves with [F_x, F_y] (force scales) and xi: `along_rod` of
+// load_families/family.py.
+struct Along {
+    V value, by[2], by_xi;
+};
+INLINE Along along_rod(const Loads& l, V x, V y, V xi) {
+    if (!std::isfinite(l.friction)) return {xi, {V{}, V{}}, splat(1.0)};
+    const V size = root(x * x + y * y + splat(l.faint * l.faint)), rate = l.friction * xi / size;
+    return {l.friction * size * xi, {rate * x, rate * y}, l.friction * size};
+}
+
 // One Gaussian's share of the table. x(j): entry j of gamma. coordinates/gaussian.py and coordinates/paper.py.
 template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t k, Gamma x, V* local) {
     const int64_t first = k * l.per_load, row = (1 + g.load_tangents) * PARTS, points = 3 * g.known->steps;
-    const bool slopes = g.load_tangents, net = l.family == GAUSSIAN, placed = l.locations;
-    const V L = splat(l.length), last = x(first + l.per_load - 1);
+    const bool slopes = g.load_tangents, net = l.family == GAUSSIAN, placed = l.locations, axial = l.axial;
+    const int64_t width = placed ? 2 : 3;
+    const V L = splat(l.length), last = x(first + width);
     const Centre centre = placed ? Centre{splat(l.locations[k]), V{}}
                           : net  ? logistic_centre(l, x(first + 2))
                                  : algebraic_centre(l, x(first + 2));
@@ -79,6 +93,7 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
     const V per_S = 1.0 / S;
     const double unit = net ? l.force_scale : 1.0;
     const V F[2] = {unit * x(first), unit * x(first + 1)};
+    const Along z = axial ? along_rod(l, x(first), x(first + 1), x(first + width + 1)) : Along{};
     V previous = splat(std::numeric_limits<double>::quiet_NaN());
     Bump b{};
     for (int64_t p = 0; p <= points; p++) {
@@ -89,6 +104,7 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
         V* to = local + p * row;
         for (int axis = 0; axis < 2; axis++)
             for (int o = 0; o < 2; o++) to[axis + 3 * o] += F[axis] * q[o];  // G, then G2
+        if (axial) to[2] += unit * z.value * q[0];
         if (!slopes) continue;
         const V q_mu[2] = {(b.once_mu - q[0] * S_mu) * per_S * dmu, (b.again_mu - q[1] * S_mu) * per_S * dmu};
         const V q_c[2] = {(b.once_c - q[0] * S_c) * per_S * dc, (b.again_c - q[1] * S_c) * per_S * dc};
@@ -97,8 +113,13 @@ template <class Gamma> void add_gaussian(const Loads& l, const Group& g, int64_t
                 const int part = axis + 3 * o;
                 to[(1 + first + axis) * PARTS + part] = unit * q[o];
                 if (!placed) to[(1 + first + 2) * PARTS + part] = F[axis] * q_mu[o];
-                to[(first + l.per_load) * PARTS + part] = F[axis] * q_c[o];
+                to[(1 + first + width) * PARTS + part] = F[axis] * q_c[o];
             }
+        if (!axial) continue;
+        for (int axis = 0; axis < 2; axis++) to[(1 + first + axis) * PARTS + 2] = unit * z.by[axis] * q[0];
+        if (!placed) to[(1 + first + 2) * PARTS + 2] = unit * z.value * q_mu[0];
+        to[(1 + first + width) * PARTS + 2] = unit * z.value * q_c[0];
+        to[(2 + first + width) * PARTS + 2] = unit * z.by_xi * q[0];
     }
 }
 
@@ -107,11 +128,17 @@ template <class Gamma> void add_point(const Loads& l, const Group& g, int64_t k,
     const int64_t first = k * l.per_load, row = (1 + g.load_tangents) * PARTS, points = 3 * g.known->steps;
     const V share = sigmoid(x(first + 2)), mu = l.length * share, dmu = mu * (1.0 - share);
     const V F[2] = {l.force_scale * x(first), l.force_scale * x(first + 1)};
+    const Along z = l.axial ? along_rod(l, x(first), x(first + 1), x(first + 3)) : Along{};
     for (int64_t p = 0; p <= points; p++) {
         const V s = p < points ? fetch(l.s, g.lanes, p) : splat(l.length);
         const V on = p < points ? select(fetch(l.inside, g.lanes, p) > mu, splat(1.0), V{}) : splat(1.0);
         const V ramp = on * (s - mu);
         V* to = local + p * row;
+        if (l.axial) {
+            to[2] += l.force_scale * z.value * on;
+            for (int axis = 0; g.load_tangents && axis < 2; axis++) to[(1 + first + axis) * PARTS + 2] = l.force_scale * z.by[axis] * on;
+            if (g.load_tangents) to[(4 + first) * PARTS + 2] = l.force_scale * z.by_xi * on;
+        }
         for (int axis = 0; axis < 2; axis++) {
             to[axis] += F[axis] * on, to[3 + axis] += F[axis] * ramp;
             if (!g.load_tangents) continue;
@@ -141,6 +168,22 @@ template <class Gamma> void move_nodes(const Loads& l, const Group& g, Gamma x, 
     }
 }
 
+// LINEAR, whose basis holds F_z = xi of every load: what is different where that depends on F.
+template <class Gamma> void bend_along(const Loads& l, const Group& g, Gamma x, V* local) {
+    const int64_t row = (1 + g.load_tangents) * PARTS, rows = 3 * g.known->steps + 1;
+    for (int64_t k = 0; k < l.count; k++) {
+        const int64_t first = k * l.per_load, xi = first + l.per_load - 1;
+        const Along z = along_rod(l, x(first), x(first + 1), x(xi));
+        for (int64_t p = 0; p < rows; p++) {
+            const double unit = l.basis[(p * l.size + xi) * PARTS + 2];
+            V* to = local + p * row;
+            to[2] += unit * (z.value - x(xi));
+            for (int axis = 0; g.load_tangents && axis < 2; axis++) to[(1 + first + axis) * PARTS + 2] += unit * z.by[axis];
+            if (g.load_tangents) to[(1 + xi) * PARTS + 2] = unit * z.by_xi;
+        }
+    }
+}
+
 // The whole table, (3 S + 1, 1 + load_tangents, PARTS): slopes for all entries of gamma, or none.
 template <class Gamma> void fill_local(const Loads& l, const Group& g, Gamma x, V* local) {
     const int64_t row = (1 + g.load_tangents) * PARTS, rows = 3 * g.known->steps + 1;
@@ -157,4 +200,5 @@ template <class Gamma> void fill_local(const Loads& l, const Group& g, Gamma x, 
                     if (g.load_tangents) local[p * row + (1 + j) * PARTS + part] = unit;
                     local[p * row + part] += x(j) * unit;
                 }
+    if (l.family == LINEAR && l.axial && std::isfinite(l.friction)) bend_along(l, g, x, local);
 }

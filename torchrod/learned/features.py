@@ -33,6 +33,7 @@ from torch import Tensor
 
 from ..estimation.at_rest import without_load
 from ..mechanics.robot import Robot
+from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
 from ..model.sensors import Markers
 from ..util.by_value import Kept, key
@@ -194,8 +195,10 @@ def features(problem: Problem) -> Features:
 
 
 def prior_log_c(problem: Problem) -> float:
-    """The prior mean of log(c L^2), which closes every Gaussian load's entries of gamma."""
-    return float(problem.state.loads.mean[-1])
+    """The prior mean of log(c L^2)."""
+    loads = problem.unknowns.loads
+    assert isinstance(loads, GaussianCoordinates)
+    return loads.log_c
 
 
 def _known(

@@ -98,12 +98,17 @@ class WarmStart:
 
     def guess(self, problem: Problem, read: Features) -> tuple[Float[Tensor, "B g"], Float[Tensor, "B g g"] | None]:
         """What the network says of features: gamma, and its covariance if that is to be believed; in the section frame."""
-        turn = turn_of_gamma(read.turn, problem.unknowns.loads.size // PER_LOAD)
+        loads = problem.unknowns.loads
+        assert isinstance(loads, GaussianCoordinates)
+        turn = turn_of_gamma(read.turn, loads.count)
         log_c = torch.full_like(read.amp, prior_log_c(problem))
         if not self.predicted_spread:
-            return _turned(turn, self.network.guess(read.x, read.amp, log_c)), None
+            return loads.with_drag(_turned(turn, self.network.guess(read.x, read.amp, log_c))), None
         prediction = self.network(read.x, read.amp, log_c)
-        return _turned(turn, prediction.gamma), turn.mT @ bounded(prediction.covariance) @ turn
+        known = loads.with_drag(torch.arange(1, 1 + PER_LOAD * loads.count)).nonzero().squeeze(-1)
+        spread = torch.eye(loads.size, dtype=read.amp.dtype).repeat(len(read.amp), 1, 1)
+        spread[:, known.unsqueeze(-1), known] = turn.mT @ bounded(prediction.covariance) @ turn
+        return loads.with_drag(_turned(turn, prediction.gamma)), spread
 
 
 def _turned(turn: Float[Tensor, "B g g"], gamma: Float[Tensor, "B g"]) -> Float[Tensor, "B g"]:

@@ -87,9 +87,9 @@ def _rows(x: Tensor, own: int, index: Int[Tensor, " b"]) -> Tensor:
     return x if x.ndim <= own or len(x) == 1 else x[index]
 
 
-def _normal_to_rod(f: Float[Tensor, "... 2"]) -> Vector:
-    """(f_x, f_y, 0): the paper's loads are normal to the rod (9)."""
-    return torch.cat([f, torch.zeros_like(f[..., :1])], -1)
+def _in_section(f: Float[Tensor, "... xy"]) -> Vector:
+    """(f_x, f_y, 0), the paper's loads are normal to the rod (9); of three components what they are."""
+    return torch.nn.functional.pad(f, (0, 3 - f.shape[-1]))
 
 
 def _per_stage(parameter: Tensor, trailing: int) -> Tensor:
@@ -101,10 +101,10 @@ def _per_stage(parameter: Tensor, trailing: int) -> Tensor:
 class GaussianLoads(Float64):
     """f(s) = sum_k a_k exp(-c_k (s - mu_k)^2), (10), with 2 c = 1 / sigma^2.
 
-    a: (..., K, 2), N/m, section frame x and y. mu: (..., K), m. c: (..., K), 1/m^2.
+    a: (..., K, 2), N/m, section frame x and y; or (..., K, 3), with drag along the rod. mu: (..., K), m. c: (..., K), 1/m^2.
     """
 
-    a: Float[Tensor, "... K 2"]
+    a: Float[Tensor, "... K xy"]
     mu: Float[Tensor, "... K"]
     c: Float[Tensor, "... K"]
 
@@ -120,9 +120,7 @@ class GaussianLoads(Float64):
         once = area * (torch.erf(x) - torch.erf(x0))
         again = area / root * (twice(x) - twice(x0) - (x - x0) * torch.erf(x0))
         a = _per_stage(self.a, 2)
-        return LoadIntegrals(
-            G=_normal_to_rod((a * once.unsqueeze(-1)).sum(-2)), G2=_normal_to_rod((a * again.unsqueeze(-1)).sum(-2))
-        )
+        return LoadIntegrals(G=_in_section((a * once.unsqueeze(-1)).sum(-2)), G2=_in_section((a * again.unsqueeze(-1)).sum(-2)))
 
     def breakpoints(self) -> None:
         """None: a Gaussian has no jump."""
@@ -134,9 +132,9 @@ class GaussianLoads(Float64):
     def density(self, s: Float[Tensor, " S"]) -> Float[Tensor, "... S 3"]:
         """f(s), (10)."""
         shape = torch.exp(-self.c.unsqueeze(-2) * (s.unsqueeze(-1) - self.mu.unsqueeze(-2)) ** 2)
-        return _normal_to_rod((self.a.unsqueeze(-3) * shape.unsqueeze(-1)).sum(-2))
+        return _in_section((self.a.unsqueeze(-3) * shape.unsqueeze(-1)).sum(-2))
 
-    def net_force(self) -> Float[Tensor, "... K 2"]:
+    def net_force(self) -> Float[Tensor, "... K xy"]:
         """The paper's (13): a sqrt(pi / c), N, as if the whole Gaussian lay on the rod."""
         return self.a * (math.pi / self.c).sqrt().unsqueeze(-1)
 
@@ -239,7 +237,7 @@ class FourierLoads(Float64):
         cosine, sine = _per_stage(self.cosine, 2), _per_stage(self.sine, 2)
 
         def combine(c: Tensor, b: Tensor) -> Vector:
-            return _normal_to_rod((cosine * c.unsqueeze(-2)).sum(-1) + (sine * b.unsqueeze(-2)).sum(-1))
+            return _in_section((cosine * c.unsqueeze(-2)).sum(-1) + (sine * b.unsqueeze(-2)).sum(-1))
 
         return LoadIntegrals(G=combine(once_c, once_s), G2=combine(again_c, again_s))
 
@@ -255,7 +253,7 @@ class FourierLoads(Float64):
         _, sin, cos = self._waves(s)
         ones = torch.cat([torch.ones_like(s).unsqueeze(-1), cos], -1)
         f = (self.cosine.unsqueeze(-3) * ones.unsqueeze(-2)).sum(-1) + (self.sine.unsqueeze(-3) * sin.unsqueeze(-2)).sum(-1)
-        return _normal_to_rod(f)
+        return _in_section(f)
 
 
 @dataclass(frozen=True)
@@ -278,9 +276,7 @@ class PolynomialLoads(Float64):
         a = _per_stage(self.coefficients, 2)
         once = self.length * self._powers(s, 1) / (k + 1)
         again = self.length**2 * self._powers(s, 2) / ((k + 1) * (k + 2))
-        return LoadIntegrals(
-            G=_normal_to_rod((a * once.unsqueeze(-2)).sum(-1)), G2=_normal_to_rod((a * again.unsqueeze(-2)).sum(-1))
-        )
+        return LoadIntegrals(G=_in_section((a * once.unsqueeze(-2)).sum(-1)), G2=_in_section((a * again.unsqueeze(-2)).sum(-1)))
 
     def breakpoints(self) -> None:
         """None: a polynomial load has no jump."""
@@ -291,4 +287,4 @@ class PolynomialLoads(Float64):
 
     def density(self, s: Float[Tensor, " S"]) -> Float[Tensor, "... S 3"]:
         """f(s)."""
-        return _normal_to_rod((self.coefficients.unsqueeze(-3) * self._powers(s, 0).unsqueeze(-2)).sum(-1))
+        return _in_section((self.coefficients.unsqueeze(-3) * self._powers(s, 0).unsqueeze(-2)).sum(-1))

@@ -66,9 +66,8 @@ def _scene(robot: Robot, fit: FittedRod, tension: Tensor | None) -> _Scene:
     assert density is not None
     height = density.norm(dim=-1)
     scale = ENVELOPE * L / float(height.max()) if float(height.max()) > 0 else 0.0
-    force = torch.cat([fit.force, torch.zeros_like(fit.force[:, :1])], -1)
     at = [int((s - x).abs().argmin()) for x in fit.location]
-    pushes = rotate(q[at], force)
+    pushes = rotate(q[at], fit.pushes)
     if fit.tip_force is not None:
         at, pushes = [*at, len(s) - 1], torch.cat([pushes, fit.tip_force.unsqueeze(0)])
     longest = float(pushes.norm(dim=-1).max()) if len(pushes) else 0.0

@@ -16,6 +16,7 @@ Gamma = Float[Tensor, "... n"]
 # Forces (in force scales), places (of the length) and the number of directions at which a single load is looked for.
 ELSEWHERE = (0.5, 1.5, 4.0), (0.4, 0.6, 0.8, 0.95), 8
 ETA_OF_RESTART = 3.0  # S(3) = 0.95
+FAINT = 1e-3  # in force scales: what a contact that hardly pushes may drag for
 WEAK_STD = 10.0  # of the priors that only keep unobservable directions finite (a load of no force has no location)
 
 
@@ -24,13 +25,15 @@ class LoadReport:
     """What a person asks for, one entry per load: force (..., K, 2) N (section frame), location (..., K) m, width (..., K) m.
 
     location is the centroid parameter mu or the point of application, width the Gaussian's sigma (0 for a point force). net_force
-    is the paper's (13), which counts what hangs over the tip; force is what acts on the rod.
+    is the paper's (13), which counts what hangs over the tip; force is what acts on the rod. axial (..., K) N: the force along the
+    rod, positive towards the tip; None where loads are normal to the rod.
     """
 
     force: Float[Tensor, "... K 2"]
     location: Float[Tensor, "... K"]
     width: Float[Tensor, "... K"]
     net_force: Float[Tensor, "... K 2"]
+    axial: Float[Tensor, "... K"] | None = None
 
 
 @runtime_checkable
@@ -73,6 +76,27 @@ class LoadFamily(Protocol):
     def describe(self, gamma: Gamma) -> LoadReport:
         """Force, location and width of each load."""
         ...
+
+
+def along_rod(force: Float[Tensor, "... K 2"], xi: Float[Tensor, "... K"], friction: float) -> Float[Tensor, "... K"]:
+    """The force along the rod (force scales) of contacts that push with `force` (force scales).
+
+        F_z = mu (|F|^2 + FAINT^2)^(1/2) xi,     xi ~ N(0, 1),
+
+    is N(0, (mu |F|)^2) in an entry xi whose prior depends on nothing else. friction: mu; infinite: F_z = xi, free.
+    """
+    return xi if math.isinf(friction) else friction * (force.square().sum(-1) + FAINT**2).sqrt() * xi
+
+
+def axial_std(friction: float | None, force_std: float) -> list[float]:
+    """Of the prior of xi: that of a force where it is free; nothing where there is no such entry."""
+    return [] if friction is None else [force_std if math.isinf(friction) else 1.0]
+
+
+def check_friction(friction: float | None) -> None:
+    """Refuse what is no coefficient of friction. Errors: ValueError."""
+    if friction is not None and not friction > 0:
+        raise ValueError(f"friction is {friction}; a contact's must be positive, infinite where the axial force is free, or None")
 
 
 def single_loads() -> tuple[Float[Tensor, "C 2"], Float[Tensor, " C"]]:
