@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..mechanics.grid import on_rod
 from ..mechanics.robot import Robot
-from ..model.marker_geometry import at_origin, too_far, too_short
+from ..model.marker_geometry import against_chords, at_origin, misturned, too_far, too_short
 from ..util.errors import InputError
 from ..util.files import put, reading
 from ..util.units import metres_per
@@ -72,12 +72,16 @@ def read_shapes(path: str | Path, robot: Robot, units: str | None = None) -> Sha
 
 
 def _check_rotations(path: Path, shapes: Shapes) -> None:
-    """Quaternions of length 1, to what a file rounds them to."""
+    """Quaternions of length 1, to what a file rounds them to, that go with the positions."""
     q = shapes.readings.get("orientations")
-    off = None if q is None else (q.norm(dim=-1) - 1).abs()
-    if q is not None and off is not None and bool((off > UNIT_QUATERNION).any()):
+    if q is None:
+        return
+    off = (q.norm(dim=-1) - 1).abs()
+    if bool((off > UNIT_QUATERNION).any()):
         size = float(q.norm(dim=-1)[off > UNIT_QUATERNION][0])
         raise InputError(f"{path}: qx,qy,qz,qw have the length {size:.3g}; a rotation is a unit quaternion, give it as such")
+    if said := misturned(lambda change: against_chords(shapes.s, shapes.positions, change(q), shapes.offsets)):
+        warnings.warn(f"{path}: {said}", stacklevel=3)
 
 
 def _scale(path: Path, asked: str | None, stated: str | None) -> float:

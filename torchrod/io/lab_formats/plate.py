@@ -5,7 +5,6 @@ Markers at places b_i of the base frame that were seen at z_i give the pose of l
 """
 
 from dataclasses import dataclass
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from .layout import Layout, Plate
 from .recording import Recording
 
 ALIKE = 0.02  # of the plate's size: so well its markers must fit it, and so well a mirrored plate must not
-MOST_TRIED = 2_000_000  # assignments of points to an unlabelled plate
+MOST_TRIED = 10_000  # triples of points that lie as the first three of an unlabelled plate
 
 
 @dataclass(frozen=True)
@@ -122,6 +121,21 @@ def _of_body(path: Path, plate: Plate, found: Recording) -> tuple[Matrix, Vector
     return turn @ own, matvec(turn, plate.pose.position) + p
 
 
+def _alike(apart: Float[np.ndarray, "N N"], wanted: Float[np.ndarray, "M M"], slack: float) -> list[tuple[int, int, int]]:
+    """Three points that are as far apart as the first three markers of the plate, every way of naming them; MOST_TRIED and one more
+    at most.
+    """
+    near = [np.abs(apart - wanted[i, j]) <= slack for i, j in ((0, 1), (0, 2), (1, 2))]
+    for of in near:
+        np.fill_diagonal(of, False)
+    found: list[tuple[int, int, int]] = []
+    for i, j in np.argwhere(near[0]):
+        found += [(int(i), int(j), int(k)) for k in np.flatnonzero(near[1][i] & near[2][j])]
+        if len(found) > MOST_TRIED:
+            break
+    return found
+
+
 def _places_of_plate(path: Path, at: Float[Tensor, "M 3"], found: Recording) -> Float[np.ndarray, "M 3"]:
     """Where the points are that lie to each other as the plate's markers do: found in the frame that shows most points, and the
     median over all frames of the points nearest to there.
@@ -134,15 +148,14 @@ def _places_of_plate(path: Path, at: Float[Tensor, "M 3"], found: Recording) -> 
     frame = int((x & y & w).sum(axis=1).argmax())
     z = every[frame][(x & y & w)[frame]]
     M, places = len(at), at.numpy()
-    if len(z) < M or len(z) ** 3 > MOST_TRIED:
-        raise InputError(f"{path}: its {len(z)} points cannot be told apart as the base plate's {M} markers; give base.names")
     wanted = np.linalg.norm(places[:, None] - places, axis=-1)
     apart = np.linalg.norm(z[:, None] - z, axis=-1)
     slack = ALIKE * float(wanted.max())
+    triples = _alike(apart, wanted, slack)
+    if len(z) < M or len(triples) > MOST_TRIED:
+        raise InputError(f"{path}: its {len(z)} points cannot be told apart as the base plate's {M} markers; give base.names")
     fits = []
-    for first in permutations(range(len(z)), 3):
-        if np.abs(apart[np.ix_(first, first)] - wanted[:3, :3]).max() > slack:
-            continue
+    for first in triples:
         chosen = list(first)
         for k in range(3, M):
             off = np.abs(apart[:, chosen] - wanted[k, :k]).max(-1)
