@@ -70,8 +70,10 @@ def _estimate_parser() -> ArgumentParser:
         default="contact",
         help="what is known of the width; auto: contact or distributed, as the data ask for",
     )
-    parser.add_argument("--noise", type=str, default="1e-3", help="std of a marker coordinate (m); auto: from the residual")
-    parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
+    noise = "std of a marker coordinate (m); auto: from the residual (default: 1e-3)"  # None tells that nobody gave it
+    parser.add_argument("--noise", type=str, default=None, help=noise)
+    angle = "std of a measured orientation, about each axis (rad) (default: 0.01)"
+    parser.add_argument("--angle-noise", type=float, default=None, help=angle)
     _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))
     parser.add_argument("--curvature-noise", type=float, default=None, help="std of a measured curvature kx, ky (1/m)")
     parser.add_argument("--robust", action="store_true", help="let markers far off weigh little, and name them")

@@ -78,7 +78,7 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
     if not len(s):
         return "No marker was seen: every position is empty or NaN."
     if len(s) == 1:
-        return "Only one marker was seen: a contact needs at least two."
+        return "Only one marker was seen: a contact needs at least two; for a tip force, try --contacts 0 --unknown-tip force."
     zero = (at_origin(markers)[sample]).nonzero().flatten()
     if len(zero):
         places = _named(zero.tolist(), markers.s)
