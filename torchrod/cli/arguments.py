@@ -10,7 +10,7 @@ from ..util.errors import InputError
 from ..util.files import writing
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
-INPUTS = ("robot", "shapes", "result", "spec", "warm_start", "file", "layout")  # options that name files to be read,
+INPUTS = ("robot", "shapes", "result", "spec", "warm_start", "file", "layout", "tensions")  # options that name files to be read,
 OUTPUTS = ("out", "plot", "json", "csv")  # and those that name files to be written
 MOST_STEPS = 100_000  # along a rod
 COARSEST = 0.25  # of the length: with more noise no shape shows

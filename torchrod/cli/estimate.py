@@ -136,7 +136,7 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot, options.units)
+    shapes = read_shapes(options.shapes, robot, options.units, options.tensions)
     noise = NOISE if options.noise is None else noise_or_auto(options.noise, robot.rod.length)
     if options.tension_std is not None:
         positive("--tension-std", options.tension_std)

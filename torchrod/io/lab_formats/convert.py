@@ -14,7 +14,7 @@ from ...mechanics.grid import on_rod
 from ...mechanics.lie import Matrix, product
 from ...mechanics.robot import Robot
 from ...model.marker_geometry import against_chords, misturned
-from ...util.errors import InputError
+from ...util.errors import InputError, shown
 from ...util.precision import DTYPE
 from ...util.units import metres_per
 from ..base_pose import BasePose
@@ -114,7 +114,7 @@ def _into_base(p: Float[Tensor, "F N 3"], base: Base) -> Float[Tensor, "F N 3"]:
 
 def _points(path: Path, found: Recording, layout: Layout, what: str, names: list[str]) -> Float[Tensor, "F N 3"]:
     if missing := [name for name in names if name not in found.points]:
-        raise InputError(f"{layout.path}: {what}.names has {missing[0]!r}, which is not in {path}; {named(found)}")
+        raise InputError(f"{layout.path}: {what}.names has {shown(missing[0])}, which is not in {path}; {named(found)}")
     return torch.from_numpy(np.stack([found.points[name] for name in names], 1))
 
 
@@ -158,7 +158,9 @@ def _bodies(path: Path, found: Recording, layout: Layout, base: Base) -> Shapes 
     assert places.names is not None
     p = _into_base(_points(path, found, layout, "bodies", places.names), base)
     if missing := [name for name in places.names if name not in found.rotations]:
-        raise InputError(f"{layout.path}: bodies.names has {missing[0]!r}, which has no rotation in {path}; list it in [markers]")
+        raise InputError(
+            f"{layout.path}: bodies.names has {shown(missing[0])}, which has no rotation in {path}; list it in [markers]"
+        )
     q = torch.from_numpy(np.stack([found.rotations[name] for name in places.names], 1))
     back = _quaternion(base.R)[:, None] * torch.tensor([-1.0, -1.0, -1.0, 1.0], dtype=DTYPE)
     q = product(back.expand_as(q), q)
@@ -188,7 +190,7 @@ def _gratings(path: Path, found: Recording, layout: Layout, places: Gratings) ->
     """Curvature as it stands, or from the strains of cores: e = e_0 + k_x y - k_y x, least squares."""
     listed = [*places.kx, *places.ky, *(name for row in places.cores for name in row)]
     if missing := [name for name in listed if name not in found.values]:
-        raise InputError(f"{layout.path}: gratings names {missing[0]!r}, which is not in {path}; {named(found)}")
+        raise InputError(f"{layout.path}: gratings names {shown(missing[0])}, which is not in {path}; {named(found)}")
     if places.core is None:
         k = np.stack([np.stack([found.values[name] for name in names], 1) for names in (places.kx, places.ky)], -1)
     else:

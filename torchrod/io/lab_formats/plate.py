@@ -4,6 +4,7 @@ Markers at places b_i of the base frame that were seen at z_i give the pose of l
 (Kabsch; roma.rigid_points_registration), for any rotation.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...mechanics.lie import Matrix, Vector, matvec
-from ...util.errors import InputError
+from ...util.errors import InputError, shown
 from .layout import Layout, Plate
 from .recording import Recording
 
 ALIKE = 0.02  # of the plate's size: so well its markers must fit it, and so well a mirrored plate must not
+MOST_NAMED, MOST_LETTERS = 12, 40  # names in a refusal, and letters of each
 MOST_TRIED = 10_000  # triples of points that lie as the first three of an unlabelled plate
 
 
@@ -46,7 +48,7 @@ def base_in(path: Path, layout: Layout, plate: Plate, found: Recording) -> Base:
         R, t, off = aligned(plate.at, z)
         return Base(R, t, float(off), (), z[0])
     if missing := [name for name in names if name not in found.points]:
-        raise InputError(f"{layout.path}: base.names has {missing[0]!r}, which is not in {path}; {named(found)}")
+        raise InputError(f"{layout.path}: base.names has {shown(missing[0])}, which is not in {path}; {named(found)}")
     z = torch.from_numpy(np.stack([found.points[name] for name in names], 1))
     if not plate.moving:
         z = z.nanmedian(0, keepdim=True).values
@@ -108,15 +110,16 @@ def _of_body(path: Path, plate: Plate, found: Recording) -> tuple[Matrix, Vector
     if plate.body is None:
         return own, plate.pose.position[None]
     if plate.body not in found.rotations:
-        known = ", ".join(found.rotations) or "none"
-        raise InputError(f"{path}: has no rigid body {plate.body!r} for the base; rigid bodies: {known}")
+        raise InputError(f"{path}: has no rigid body {shown(plate.body)} for the base; rigid bodies: {listed(found.rotations)}")
     q, p = (torch.from_numpy(of[plate.body]) for of in (found.rotations, found.points))
     turn = roma.unitquat_to_rotmat(torch.where(torch.isfinite(q), q, q.new_tensor([0.0, 0.0, 0.0, 1.0])))
     gone = ~torch.isfinite(q).all(-1)
     turn = torch.where(gone[:, None, None], torch.nan, turn)
     if not plate.moving:
         if bool(gone.all()):
-            raise InputError(f"{path}: the rigid body {plate.body!r} of the base was never seen; name markers of the plate instead")
+            raise InputError(
+                f"{path}: the rigid body {shown(plate.body)} of the base was never seen; name markers of the plate instead"
+            )
         turn, p = torch.as_tensor(roma.special_procrustes(turn[~gone].mean(0)))[None], p.nanmedian(0, keepdim=True).values
     return turn @ own, matvec(turn, plate.pose.position) + p
 
@@ -181,5 +184,10 @@ def _places_of_plate(path: Path, at: Float[Tensor, "M 3"], found: Recording) -> 
 
 def named(found: Recording) -> str:
     """The names that there are, as a refusal lists them."""
-    names = list(found.points) or list(found.values)
-    return f"names: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
+    return f"names: {listed(found.points or found.values)}"
+
+
+def listed(names: Iterable[str]) -> str:
+    """The first of them, or none."""
+    every = [name if len(name) <= MOST_LETTERS else f"{name[:MOST_LETTERS]}..." for name in names]
+    return ", ".join([*every[:MOST_NAMED], *(["..."] if len(every) > MOST_NAMED else [])]) or "none"
