@@ -44,7 +44,7 @@ REFUSED = {
     "camera frame": ([[s, x + 1.5, y, z] for s, x, y, z in GOOD], "the unit fits, so give them in the robot's base frame"),
     "camera frame, millimetres": ([[s, 1e3 * x - 900, 1e3 * y, 1e3 * z + 700] for s, x, y, z in GOOD], "are they in millimetres?"),
     "the same s twice": ([*GOOD[:5], GOOD[4], *GOOD[5:]], "two markers at s = 0.1 m; keep one"),
-    "one marker": (GOOD[9:10], "1 marker cannot determine 4 unknowns; add markers"),
+    "one marker": (GOOD[9:10], "a single marker cannot tell a contact and its place; add markers or"),
 }
 
 

@@ -412,3 +412,38 @@ def test_damaged_binary_files_are_refused(tmp_path, capsys, content):
     assert main(["estimate", robot, bad]) == 2
     assert main(["plot", robot, str(tmp_path / "ok.csv"), bad, "--out", str(tmp_path / "f.png")]) == 2
     assert capsys.readouterr().err.count("\n") == 2
+
+
+IDLE = {
+    "--noise": (["--noise", "1e-3"], "states the noise of every position, sx"),
+    "--angle-noise": (["--angle-noise", "0.01"], "has no orientations qx,qy,qz,qw"),
+    "--curvature-noise": (["--curvature-noise", "1"], "has no curvatures kx,ky"),
+    "--base-noise": (["--base-noise", "1", "1"], "has no base wrenches base_fx, .."),
+    "--tension-std": (["--tension-std", "1"], "has no tendons"),
+    "--load-prior": (["--load-prior", "point", "--contacts", "0"], "--contacts 0 leaves no load"),
+    "--intervals sampled": (["--intervals", "sampled", "--out", "loads.csv"], "name one by --out or --plot"),
+    "--profile on": (["--profile", "on"], "only RESULT.json and RESULT.npz have profiles"),
+}
+
+
+@pytest.mark.parametrize("option", IDLE)
+def test_options_with_nothing_to_act_on_are_told(tmp_path, capsys, monkeypatch, option):
+    """Each in one line, and none of them is told where there is something."""
+    monkeypatch.chdir(tmp_path)
+    given, why = IDLE[option]
+    rows = STRAIGHT.splitlines()
+    text = [rows[0] + (",sx" * (option == "--noise")), *(row + (",0.001" * (option == "--noise")) for row in rows[1:])]
+    (tmp_path / "robot.toml").write_text(ROD)
+    (tmp_path / "shapes.csv").write_text("\n".join(text))
+    assert main(["estimate", "robot.toml", "shapes.csv", "--steps", "5", *given]) == 0
+    said = capsys.readouterr().err
+    assert f"warning: {option} has no effect: " in said and why in said and said.count("\n") == 1
+    assert main(["estimate", "robot.toml", "shapes.csv", "--steps", "5", "--contacts", "0"]) == 0
+    assert "no effect" not in capsys.readouterr().err
+
+
+def test_a_table_of_loads_is_not_drawn(tmp_path, capsys):
+    run(tmp_path, ROD, STRAIGHT, "--steps", "5", "--contacts", "0")
+    names = [str(tmp_path / name) for name in ("robot.toml", "shapes.csv", "loads.csv", "f.png")]
+    assert main(["plot", *names[:3], "--out", names[3]]) == 2
+    assert "a table of loads lacks what a figure needs; write RESULT.json by estimate --out" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,8 @@ from torchrod import PointForces, Shapes, read_shapes, solve_shape
 from torchrod.cli import main
 from torchrod.cli.lab_import import _warn_of_distance
 from torchrod.cli.parser import IMPORTED
-from torchrod.io.lab_formats import FORMATS, Imported
+from torchrod.io.lab_formats import FORMATS, Imported, labels
+from torchrod.io.lab_formats.labels import labelled, rod_of
 
 ROOT = Path(__file__).resolve().parents[1]
 ROD = (ROOT / "docs" / "example" / "rod.toml").read_text()
@@ -232,6 +234,36 @@ def test_trackers_with_six_degrees_of_freedom(tmp_path, form, write):
     assert np.abs(Rotation.from_quat(found).as_matrix() - own[seen]).max() < 5e-4
 
 
+@pytest.mark.parametrize("wrong", ["w first", "inverse", "none"])
+def test_rotations_that_do_not_go_with_the_positions_are_told(tmp_path, capsys, wrong):
+    """w first in columns that are called x, y, z, w, or inverse rotations: said at import, and where shapes are read."""
+    t = take(6, 2.0)
+    q, lab = Rotation.from_quat(t.q.reshape(-1, 4)), POSE.as_quat()
+    q = (q.inv() if wrong == "inverse" else q).as_quat().reshape(t.q.shape)[:, [1, 4, 7]]
+    names = [f"qw{i},qx{i},qy{i},qz{i}" if wrong == "none" else f"qx{i},qy{i},qz{i},qw{i}" for i in "abc"]
+    if wrong != "inverse":
+        q = q[..., [3, 0, 1, 2]]
+    rows = [",".join(f"{n},x{i},y{i},z{i}" for n, i in zip(names, "abc", strict=True))]
+    rows += [cells(np.concatenate([np.r_[q[k, i], t.markers[k, m]] for i, m in enumerate((1, 4, 7))]), 9) for k in range(6)]
+    plan = f"units = 'm'\n[base]\nposition = {ORIGIN.tolist()}\nrotation = {lab.tolist()}\n"
+    plan += f"[bodies]\nnames = ['a', 'b', 'c']\ns = {S[[1, 4, 7]].tolist()}\n"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of reading it back, which is looked at below
+        imported(tmp_path, "wide", "\n".join(rows), plan)
+    said = capsys.readouterr().err
+    assert said.count("\n") == (wrong != "none")
+    assert ("read with w first they would" in said) == (wrong == "w first")
+    assert ("read as the inverse rotation they would" in said) == (wrong == "inverse")
+    own = solve_shape(steel_rod(), (PointForces(T([[[1.0, 0.3, 0.0]]]), T([[0.3]])),), None, T(S), 1)
+    order = [3, 0, 1, 2] if wrong == "w first" else [0, 1, 2, 3]
+    q = own.q[..., order] * (T([-1, -1, -1, 1]) if wrong == "inverse" else 1)
+    np.savez(tmp_path / "q.npz", s=S, positions=own.p.numpy(), orientations=q.numpy())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        read_shapes(tmp_path / "q.npz", steel_rod())
+    assert len(told) == (wrong != "none")
+
+
 CORES = np.array([[math.cos(a), math.sin(a)] for a in (0.3, 2.4, 4.5)]) * 35e-6
 
 
@@ -303,6 +335,33 @@ def test_the_rod_labels_its_markers(tmp_path_factory, seed):
     assert (told | gone).mean() > 0.95
 
 
+def test_what_is_no_rod_ends_soon(tmp_path, capsys, monkeypatch):
+    """600 frames of points near the base that lie as on no such rod: refused after a few first frames, in one sentence."""
+    begun, tried = labels._begun, []
+    monkeypatch.setattr(labels, "_begun", lambda *a: tried.append(0) or begun(*a))
+    t, g = take(600), np.random.default_rng(0)
+    points = {str(i): g.normal(0, 0.05, (600, 3)) for i in range(9)}
+    (tmp_path / "rod.toml").write_text(ROD)
+    (tmp_path / "layout.toml").write_text(f"up = 'y'\n[base]\nposition = [0, 0, 0]\n[markers]\ns_mm = {(1e3 * S).tolist()}\n")
+    (tmp_path / "file").write_text(headerless(t, points))
+    assert main(["import", "motive", str(tmp_path / "file"), *_options(tmp_path)]) == 2
+    assert 0 < len(tried) <= 3 * labels.PATIENCE
+    said = capsys.readouterr().err
+    assert "in hardly any of its 600 frames" in said and said.count("\n") == 1
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_a_rod_that_was_lost_is_found_again():
+    """In no more than twice the frames that it was away for."""
+    t, g, away = take(70), np.random.default_rng(0), 25
+    frames = t.own.copy()
+    frames[10 : 10 + away] = g.normal(0, 0.05, (away, *t.own.shape[1:]))
+    found = labelled(rod_of(steel_rod(), S, None), frames)
+    told = np.isfinite(found[..., 0])
+    assert told[:10].all() and told[10 + 2 * away :].all()
+    assert told[10 : 10 + away].mean() < 0.05
+
+
 @pytest.mark.parametrize("form", ["solid", "flat"])
 def test_left_handed_exports_are_told(tmp_path, capsys, form):
     """A mirrored world, with a plate whose markers are in one plane or not: it is said, and left_handed = true mends it."""
@@ -344,7 +403,7 @@ LAB = {
     "vicon_markers_head.csv": ("vicon", ["boite:gauche_ext", "boite:gauche_int", "boite:droite_int"], ""),
     "markers_head.trc": ("trc", ["boite_gauche_ext", "boite_gauche_int", "boite_droite_int"], ""),
     "markers_analogs.c3d": ("c3d", ["boite:gauche_ext", "boite:gauche_int", "boite:droite_int"], ""),
-    "motive_headerless.csv": ("motive", None, "up = 'y'"),
+    "motive_headerless.csv": ("motive", ["point 1", "point 2", "point 3"], "up = 'y'"),
     "ndi_aurora.csv": ("aurora", ["a", "b", "d"], ""),
     "fbgs_illumisense_head.txt": ("fbgs", None, ""),
 }
@@ -373,7 +432,7 @@ def test_real_files(tmp_path, file):
         "vicon_markers_head.csv": ("x", 0.0441628),
         "ndi_aurora.csv": ("sample", 0),
         "fbgs_illumisense_head.txt": ("s", 0.1),
-        "motive_headerless.csv": ("s", 0.1),
+        "motive_headerless.csv": ("x", 0.20519),
     }.get(file)
     if known:
         assert float(first[column[known[0]]]) == pytest.approx(known[1], abs=1e-9)

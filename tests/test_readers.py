@@ -13,14 +13,14 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from studies import fuzz
 
 from tests.robots import steel_rod
 from torchrod import Markers, Robot, Rod, Shapes, Tendon, Tendons, read_robot, read_shapes, write_shapes
 from torchrod.cli import main
-from torchrod.data.spec_file import read_dataset_spec
 from torchrod.io import read_fit
 from torchrod.io.npz_file import UNREADABLE, read_arrays
-from torchrod.learned.network import Network, load_checkpoint, numbers_in, save_checkpoint
+from torchrod.learned.network import load_checkpoint, numbers_in
 from torchrod.model.marker_geometry import misplaced
 from torchrod.util.errors import InputError
 
@@ -220,101 +220,95 @@ def test_what_is_no_robot(make, words):
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory) -> dict[str, Path]:
-    """One small sound file of every kind that is read."""
+def files(tmp_path_factory) -> tuple[Path, dict[str, str]]:
+    """A folder with one small sound file of every kind that is read, and their names by kind."""
     folder = tmp_path_factory.mktemp("sound")
-    (folder / "robot.toml").write_text(ROD)
-    (folder / "shapes.csv").write_text("sample,s,x,y,z\n" + "\n".join("a," + ",".join(map(repr, row)) for row in GOOD) + "\n")
-    table = np.array(GOOD)
-    np.savez(folder / "shapes.npz", s=table[:, 0], positions=table[None, :, 1:])
-    np.savez_compressed(folder / "deflated.npz", s=table[:, 0], positions=table[None, :, 1:])
-    robot, shapes = str(folder / "robot.toml"), str(folder / "shapes.csv")
-    for name in ("result.json", "result.npz"):
-        assert main(["estimate", robot, shapes, "--steps", "10", "--out", str(folder / name)]) == 0
-    (folder / "spec.toml").write_text(
-        '[dataset]\nsamples = 3\n[robot]\nfile = "robot.toml"\n[loads]\nforce = [0.1, 0.2]\nlocation = [0.2, 1.0]\n'
-    )
-    card = {"contacts": 1, "load_priors": ["contact"], "tendons": [0, 0], "active": False, "predicted_spread": True}
-    save_checkpoint(folder / "start.safetensors", Network(6, 1, 4, 2), card | {"range": {"amp": [0.0, 1.0]}})
-    return {path.name: path for path in folder.iterdir()}
+    return folder, fuzz.sound(folder)
 
 
-def read(path: Path, robot: Robot) -> None:
-    if path.name.startswith("result"):
-        read_fit(path, "a", None, None, 0.4)
-    elif path.name == "spec.toml":
-        read_dataset_spec(path)
-    elif path.suffix == ".toml":
-        read_robot(path)
-    elif path.name.startswith("start"):
-        load_checkpoint(path.with_suffix(".safetensors"))
-    else:
-        read_shapes(path, robot)
-
-
-WORDS = [b"1e999", b"-1", b"nan", b"null", b'""', b"[]", b"{}", b"true", b"0x" + b"f" * 5000, b"[" * 5000, b"\\u0000", b"\0", b"'"]
 KINDS = [
-    *("robot.toml", "shapes.csv", "shapes.npz", "deflated.npz", "result.json", "result.npz"),
-    *("spec.toml", "start.json", "start.safetensors"),
+    *("robot.toml", "sections.toml", "spec.toml", "calibrated", "shapes.csv", "everything.csv", "shapes.npz", "deflated.npz"),
+    *("result.json", "result.npz", "start.json", "start.safetensors", "tensions.csv"),
+    *(of for form in fuzz.FORMS if form != "c3d" for of in (form, f"layout of {form}")),
 ]
 
 
-def mutated(content: bytes, chance: random.Random) -> bytes:
-    """A few bytes changed, dropped, doubled or replaced by a word, or the file cut."""
-    out = bytearray(content)
-    for _ in range(chance.choice([1, 1, 2, 5])):
-        i, n = chance.randrange(len(out) + 1), chance.choice([0, 1, 1, 4, 16])
-        fresh = chance.choice([b"", chance.randbytes(n), chance.choice(WORDS), bytes(out[i : i + n]) * 2])
-        out[i : i + n] = fresh
-    return bytes(out[: chance.randrange(len(out) + 1)] if chance.random() < 0.1 else out)
+def test_every_kind_is_damaged(files):
+    assert {*KINDS} == {*files[1]} - {"c3d"}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.filterwarnings("ignore")
-def test_damaged_files_are_read_or_refused_in_one_sentence(files, tmp_path, kind):
-    robot, chance, refused = steel_rod(), random.Random(kind), 0
-    for file in files.values():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    for _ in range(60):
-        (tmp_path / kind).write_bytes(mutated(files[kind].read_bytes(), chance))
-        try:
-            read(tmp_path / kind, robot)
-        except InputError as error:
-            refused += 1
-            assert len(str(error)) < 1000
-    assert refused
+@given(seed=st.integers(0, 2**32))
+@settings(max_examples=20, deadline=None)
+def test_damaged_files_are_read_or_refused_in_one_sentence(files, kind, seed):
+    """Bytes, lines, cells, arrays and values changed; scripts/fuzz.py does the same with thousands."""
+    folder, names = files
+    fuzz.trial(folder, kind, names[kind], (folder / names[kind]).read_bytes(), steel_rod(), seed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_damaged_c3d(files, seed):
+    """In a process of its own, which may end as it likes."""
+    pytest.importorskip("ezc3d")
+    folder, names = files
+    fuzz.trial(folder, "c3d", names["c3d"], (folder / names["c3d"]).read_bytes(), steel_rod(), seed)
+
+
+COMMANDS = {
+    "markers.csv": "estimate plain.toml markers.csv --steps 5 --max-iterations 5 --out out.json",
+    "plain.toml": "estimate plain.toml markers.csv --steps 5 --max-iterations 5 --out out.json",
+    "motive.txt": "import motive motive.txt --robot plain.toml --layout motive.toml --out out.csv",
+    "motive.toml": "import motive motive.txt --robot plain.toml --layout motive.toml --out out.csv",
+    "result.json": "plot plain.toml markers.csv result.json --sample 0 --out out.png",
+}
+
+
+@pytest.mark.parametrize("file", COMMANDS)
+def test_commands_end_with_an_answer_or_one_line(files, monkeypatch, capsys, file):
+    """Exit status 0 with a file, or 2 with one line beside the warnings and no file."""
+    folder, _ = files
+    monkeypatch.chdir(folder)
+    command, sound = COMMANDS[file].split(), (folder / file).read_bytes()
+    out, ends = folder / command[-1], set()
+    for seed in range(3 if file == "result.json" else 8):  # figures take longer
+        (folder / file).write_bytes(fuzz.damaged(sound, file, random.Random(seed)))
+        status = main(command)
+        (folder / file).write_bytes(sound)
+        said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("torchrod: warning: ")]
+        assert (status, len(said), out.exists()) in ((0, 0, True), (2, 1, False))
+        assert all(line.startswith("torchrod: ") for line in said)
+        out.unlink(missing_ok=True)
+        ends.add(status)
+    assert ends == {0, 2}
 
 
 @pytest.mark.parametrize("kind", ["result.json", "start.json"])
 @pytest.mark.filterwarnings("ignore")
-def test_values_of_other_types_are_refused(files, tmp_path, kind):
+def test_values_of_other_types_are_refused(files, kind):
     """Every value of a JSON file in turn, replaced by one of another type or shape."""
-    for file in files.values():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
+    folder, _ = files
+    sound = (folder / kind).read_bytes()
 
     def places(value, where=()):
         yield where
         for key, inner in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
             yield from places(inner, (*where, key))
 
-    content = json.loads(files[kind].read_text())
-    for where in [w for w in places(content) if w and "profile" not in w]:
+    for where in [w for w in places(json.loads(sound)) if w and "profile" not in w]:
         for other in (None, "x", True, -1, 1e300, [], [[1.0]], {"a": 1}, 10**9):
-            fresh = json.loads(files[kind].read_text())
+            fresh = json.loads(sound)
             inner = fresh
             for key in where[:-1]:
                 inner = inner[key]
             inner[where[-1]] = other
-            (tmp_path / kind).write_text(json.dumps(fresh))
-            try:
-                read(tmp_path / kind, steel_rod())
-            except InputError as error:
-                assert "\n" not in str(error)
+            (folder / kind).write_text(json.dumps(fresh))
+            fuzz.refused(folder, kind, steel_rod())
+    (folder / kind).write_bytes(sound)
 
 
 def test_a_card_of_an_enormous_network_is_refused_before_it_is_made(files, tmp_path):
     for name in ("start.json", "start.safetensors"):
-        (tmp_path / name).write_bytes(files[name].read_bytes())
+        (tmp_path / name).write_bytes((files[0] / name).read_bytes())
     network, card = load_checkpoint(tmp_path / "start.safetensors")
     state = network.state_dict().values()
     assert sum(v.numel() for v in state) == numbers_in(**card["network"])
@@ -359,6 +353,35 @@ def test_crafted_archives(tmp_path, name):
     for file in ("a.npz", "result.npz"):
         (tmp_path / file).write_bytes(ARCHIVES[name])
         with pytest.raises(InputError, match=r"is not an NPZ of plain numbers|is not a result of torchrod estimate"):
-            read(tmp_path / file, steel_rod())
+            read_fit(tmp_path / file, "a") if file == "result.npz" else read_shapes(tmp_path / file, steel_rod())
     with pytest.raises(UNREADABLE):
         read_arrays(tmp_path / "a.npz")
+
+
+def test_tensions_over_time(tmp_path, capsys):
+    """A file at another rate, cells read in turn, one a little below zero: interpolated, with one warning; otherwise refused."""
+    (tmp_path / "robot.toml").write_text(ROD + "[[tendons]]\noffset = [0.007, 0]\n[[tendons]]\noffset = [0, 0.007]\n")
+    times = [0.1, 0.25, 0.4]
+    rows = [f"{t},{s!r},{x},{y},{z}" for t in times for s, x, y, z in GOOD]
+    (tmp_path / "s.csv").write_text("time,s,x,y,z\n" + "\n".join(rows))
+    ticks = [0.07 * k for k in range(7)]
+    pulls = [f"{t!r};{2 * t if k % 2 == 0 else ''};{-0.01 if k % 2 else -0.02 + 0.1 * t};note" for k, t in enumerate(ticks)]
+    (tmp_path / "t.csv").write_text("time;tension_1;tension_2;remark\n" + "\n".join(pulls))
+    command = ["estimate", *(str(tmp_path / n) for n in ("robot.toml", "s.csv")), "--contacts", "0", "--steps", "5"]
+    assert main([*command, "--tensions", str(tmp_path / "t.csv")]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 2 and "'remark' is not known" in said[0] and "negative tensions" in said[1] and "t.csv" in said[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        shapes = read_shapes(tmp_path / "s.csv", read_robot(tmp_path / "robot.toml"), None, tmp_path / "t.csv")
+    assert shapes.tension is not None
+    assert torch.allclose(shapes.tension[:, 0], torch.tensor([2 * t for t in times], dtype=torch.float64), atol=1e-12)
+    refusals = {"by 1 s": "1 of 3 samples", "robot": "has no tendons", "times": "has no times"}
+    (tmp_path / "t.csv").write_text("time;tension_1;tension_2\n0.2;1;1\n0.45;1;1\n")
+    (tmp_path / "rod.toml").write_text(ROD)
+    (tmp_path / "still.csv").write_text("s,x,y,z\n" + "\n".join(rows[0].partition(",")[2:]))
+    for (robot, shapes), words in zip((("robot", "s"), ("rod", "s"), ("robot", "still")), refusals.values(), strict=True):
+        command = ["estimate", str(tmp_path / f"{robot}.toml"), str(tmp_path / f"{shapes}.csv")]
+        assert main([*command, "--tensions", str(tmp_path / "t.csv")]) == 2
+        said = capsys.readouterr().err
+        assert words in said and said.count("\n") == 1

@@ -43,6 +43,10 @@ ITERATIONS = 60
 ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
 MOST_TOLD = 2  # other solutions in a message; the result file has them all
+ONE_PLACE = (
+    "All was read at s = {:.4g} mm, where one contact looks like another; for a force at the tip, try --contacts 0 "
+    "--unknown-tip force."
+)
 CHUNK = 64  # samples at a time: the table of exchanges holds (markers)^3 numbers of each while it is made
 
 
@@ -315,6 +319,8 @@ def diagnose(
     def misplaced_at(b: int) -> str:
         if markers is not None:
             return misplaced(markers, b, L)
+        if problem.unknowns.tip == "none" and len(problem.s.unique()) == 1:
+            return ONE_PLACE.format(1e3 * float(problem.s[0]))
         return next((said for c in problem.sensors if isinstance(c, CentreLine) and (said := c.misplaced(b))), "")
 
     for b in (~fit.accepted & ~torch.isfinite(fit.chi2)).nonzero().flatten().tolist():

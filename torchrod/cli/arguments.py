@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # torchrod --help imports no torch
     from ..io import Calibrated, Shapes
 
 FIGURE_SUFFIXES = (".png", ".pdf", ".svg")
-INPUTS = ("robot", "shapes", "result", "spec", "warm_start", "file", "layout")  # options that name files to be read,
+INPUTS = ("robot", "shapes", "result", "spec", "warm_start", "file", "layout", "tensions")  # options that name files to be read,
 OUTPUTS = ("out", "plot", "json", "csv")  # and those that name files to be written
 NOISE = 1e-3  # m, of a marker's coordinate, where nothing better is known
 MOST_STEPS = 100_000  # along a rod

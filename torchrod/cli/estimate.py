@@ -4,7 +4,9 @@ import math
 import warnings
 
 import torch
+from jaxtyping import Bool
 from jsonargparse import Namespace
+from torch import Tensor
 
 from ..analysis.count import Hypothesis, StartFor
 from ..analysis.diagnosis import ROBUST
@@ -25,6 +27,8 @@ from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, noise_or_auto, pos
 from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 5 ms each
+ANGLE_NOISE = 0.01  # rad
+NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
 
 
@@ -72,6 +76,49 @@ def _registration(options: Namespace) -> Registration | None:
     return Registration(shift, turn, Scope.SHARED if options.one_frame else Scope.SAMPLE)
 
 
+def _warn_of_idle(options: Namespace, robot: Robot, shapes: Shapes) -> None:
+    """Say of every option that has nothing to act on."""
+    seen = torch.isfinite(shapes.positions).all(-1)
+    stated = shapes.readings.get("position_std")
+    unstated = seen if stated is None else seen & ~torch.isfinite(stated[..., 0])
+    lacks = {name: f"{options.shapes} has no {columns}" for name, columns in NOISE_OF.items() if name not in shapes.readings}
+    whole = options.out is not None and not options.out.endswith(".csv")
+    idle = {
+        "--noise": options.noise is not None and not bool(unstated.any()) and f"{options.shapes} {_own_noise(seen)}",
+        "--angle-noise": options.angle_noise is not None and lacks.get("orientations"),
+        "--curvature-noise": options.curvature_noise is not None and lacks.get("curvature"),
+        "--base-noise": options.base_noise is not None and lacks.get("base_wrench"),
+        "--tension-std": options.tension_std is not None and not len(robot.tendons) and f"{options.robot} has no tendons",
+        "--load-prior": options.load_prior != "contact" and options.contacts == "0" and "--contacts 0 leaves no load",
+        "--intervals sampled": options.intervals == "sampled" and _unused_intervals(options, whole),
+        "--profile on": options.profile == "on" and not whole and "only RESULT.json and RESULT.npz have profiles (--out)",
+    }
+    for option, why in idle.items():
+        if why:
+            warnings.warn(f"{option} has no effect: {why}", stacklevel=2)
+
+
+def _own_noise(seen: Bool[Tensor, "B P"]) -> str:
+    return "states the noise of every position, sx" if bool(seen.any()) else "has no positions x,y,z"
+
+
+def _unused_intervals(options: Namespace, whole: bool) -> str:
+    if options.one_frame:
+        return "draws of one sample cannot have the error of a base frame that all share (--one-frame)"
+    return "" if whole or options.plot else "only RESULT.json, RESULT.npz and FIGURE show intervals; name one by --out or --plot"
+
+
+def _check_enough(options: Namespace, problem: Problem) -> None:
+    """Refuse a single place that is to tell of a contact, with what it can tell of. Errors: InputError."""
+    if problem.determined or len(problem.s.unique()) > 1:
+        return
+    read = "a single marker" if problem.markers is not None else "what was read at a single place"
+    raise InputError(
+        f"{options.shapes}: {read} cannot tell a contact and its place; add markers or, for a force at the tip, try "
+        "--contacts 0 --unknown-tip force"
+    )
+
+
 def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | None) -> Problem:
     """The readings, with one load among the unknowns, whose number and width the hypotheses replace."""
     rod = robot.rod
@@ -80,13 +127,14 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     nearly = read_uncertainty(options.robot)
     registration = _registration(options) or nearly.frame_of_a_sample
     stated = STATED * rod.length if noise is None else noise
-    positive("--angle-noise", options.angle_noise)
+    angle = ANGLE_NOISE if options.angle_noise is None else options.angle_noise
+    positive("--angle-noise", angle)
     for value in options.base_noise or ():
         positive("--base-noise", value)
     base = None if options.base_noise is None else (options.base_noise[0], options.base_noise[1])
     if options.curvature_noise is not None:
         positive("--curvature-noise", options.curvature_noise)
-    noises = Noises(stated, options.angle_noise, base, options.curvature_noise)
+    noises = Noises(stated, angle, base, options.curvature_noise)
     try:
         unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.of_a_sample)
         return Problem(robot, unknowns, shapes.sensors(noises), shapes.tension, options.steps or 0)
@@ -97,7 +145,7 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
 def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot, options.units)
+    shapes = read_shapes(options.shapes, robot, options.units, options.tensions)
     calibrated = read_uncertainty(options.robot).calibrated
     shapes = as_calibrated(options.shapes, shapes, calibrated)
     usual = calibrated.noise if calibrated is not None else None
@@ -107,9 +155,11 @@ def estimate(options: Namespace) -> None:
     positive("--max-iterations", options.max_iterations)
     writable(options.out, RESULT_SUFFIXES)
     writable(options.plot, FIGURE_SUFFIXES)
+    _warn_of_idle(options, robot, shapes)
     problem = _problem(options, robot, shapes, noise)
     count, at = _count(options, robot), options.location or None
     candidates = contact_hypotheses(problem, count, options.load_prior, at, _friction(options))
+    _check_enough(options, problem.of(next((c for c in candidates if c.contacts), candidates[0]).unknowns))
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     sampled = options.intervals == "sampled" and bool(options.out or options.plot)  # which the table does not show
     try:

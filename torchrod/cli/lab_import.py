@@ -1,6 +1,7 @@
 """torchrod import: a file of a measuring system to shapes."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -8,6 +9,7 @@ from jsonargparse import Namespace
 
 from ..io import read_base_pose, read_robot, write_shapes
 from ..io.lab_formats import Imported, convert, read_layout, read_recording
+from ..io.shape_file import with_tensions
 from ..util.errors import InputError
 from .arguments import writable
 
@@ -31,6 +33,8 @@ def lab_import(options: Namespace) -> None:
     if not len(found.shapes.samples):
         raise InputError(f"{options.file}: holds no frames; export it again")
     _warn_of_distance(options.file, found)
+    if options.tensions is not None:
+        found = replace(found, shapes=with_tensions(Path(options.file), found.shapes, robot, options.tensions))
     write_shapes(options.out, found.shapes)
     print(_report(options.out, found))  # noqa: T201
 

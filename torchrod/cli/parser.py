@@ -55,6 +55,11 @@ def _units(parser: ArgumentParser) -> None:
     )
 
 
+def _tensions(parser: ArgumentParser) -> None:
+    help = "TENSIONS.csv: time,tension_1,.. (s, N) at a rate of their own, matched to the samples' times"
+    parser.add_argument("--tensions", type=str, default=None, help=help)
+
+
 def _estimate_parser() -> ArgumentParser:
     parser = _Parser(
         description="Estimate where, which way and how hard a robot is pushed, from the measured positions of its markers."
@@ -73,11 +78,13 @@ def _estimate_parser() -> ArgumentParser:
     drag = "friction of the contacts: each may drag along the rod by 0 +- MU times its force"
     parser.add_argument("--contact-friction", type=float, default=None, metavar="MU", help=drag)
     parser.add_argument("--axial", action="store_true", help="each load may drag along the rod by any force, whatever its friction")
-    about = "std of a marker coordinate (m); auto: from the residual; by default as calibrated, else 1e-3"
-    parser.add_argument("--noise", type=str, default=None, help=about)
-    parser.add_argument("--angle-noise", type=float, default=0.01, help="std of a measured orientation, about each axis (rad)")
+    about = "std of a marker coordinate (m); auto: from the residual (default: as calibrated, else 1e-3)"
+    parser.add_argument("--noise", type=str, default=None, help=about)  # None tells that nobody gave it
+    angle = "std of a measured orientation, about each axis (rad) (default: 0.01)"
+    parser.add_argument("--angle-noise", type=float, default=None, help=angle)
     _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))
     parser.add_argument("--curvature-noise", type=float, default=None, help="std of a measured curvature kx, ky (1/m)")
+    _tensions(parser)
     parser.add_argument("--robust", action="store_true", help="let markers far off weigh little, and name them")
     parser.add_argument("--tension-std", type=float, default=None, help="std of the tensions' sensors (N); else exact")
     parser.add_argument("--warm-start", type=str, default="auto", help="auto: a learned start where one fits; off; or CHECKPOINT")
@@ -199,6 +206,7 @@ def _import_parser() -> ArgumentParser:
     parser.add_argument("file", type=str, help="the file, as it was exported")
     parser.add_argument("--robot", type=str, required=True, help="ROBOT.toml")
     parser.add_argument("--layout", type=str, required=True, help="LAYOUT.toml: which name is what on the robot")
+    _tensions(parser)
     parser.add_argument("--out", type=str, required=True, help="SHAPES.csv or .npz")
     return parser
 
@@ -209,6 +217,7 @@ def _plot_parser() -> ArgumentParser:
     parser.add_argument("shapes", type=str, help="the shapes that were estimated")
     _units(parser)
     parser.add_argument("result", type=str, help="RESULT.json or .npz of torchrod estimate")
+    _tensions(parser)
     parser.add_argument("--sample", type=str, default=None, help="which sample; the first by default")
     parser.add_argument("--out", type=str, required=True, help="FIGURE.png")
     return parser

@@ -12,7 +12,7 @@ def plot(options: Namespace) -> None:
     from ..plotting.estimate import draw
 
     robot = read_robot(options.robot)
-    shapes = read_shapes(options.shapes, robot, options.units)
+    shapes = read_shapes(options.shapes, robot, options.units, options.tensions)
     shapes = as_calibrated(options.shapes, shapes, read_uncertainty(options.robot).calibrated)
     sample = shapes.samples[0] if options.sample is None else options.sample
     if sample not in shapes.samples:

@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 from itertools import pairwise
 from pathlib import Path
 
@@ -37,6 +38,8 @@ def simulate(options: Namespace) -> None:
         raise InputError(f"--seed is {options.seed}; it must be from 0 to 2^63 - 1")
     if not (math.isfinite(options.noise) and options.noise >= 0):
         raise InputError(f"--noise is {options.noise}; it must be at least 0")
+    if options.seed and not options.noise:
+        warnings.warn("--seed has no effect: it is of the noise; add --noise", stacklevel=2)
     if options.steps is not None and not 1 <= options.steps <= MOST_STEPS:
         raise InputError(f"--steps is {options.steps}; it must be from 1 to {MOST_STEPS}")
     writable(options.out, (".csv",))

@@ -4,8 +4,10 @@ import csv
 import io
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import IO
@@ -17,6 +19,7 @@ from ..util.errors import InputError, shown
 
 DECIMAL_COMMA = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*", re.ASCII)
 MARKS = (",", ";", "\t")
+ALIKE = 0.85  # of difflib: one letter more or less in a word
 
 
 @dataclass(frozen=True)
@@ -100,3 +103,16 @@ def read_table(path: Path, file: IO[bytes], is_header: Callable[[list[str]], boo
                 f"{path}: line {number} has {len(row)} cells, the header {len(header)}; leave a missing marker's cells empty"
             )
     return Table(path, header, [row for _, row in rows], [number for number, _ in rows], mark != ",", remarks)
+
+
+def ignored(path: Path, what: str, unknown: list[str], known: list[str]) -> None:
+    """Say once what is left aside; refuse what looks like a slip of the pen, which would lose a measurement. Errors: InputError."""
+    for name in unknown:
+        if near := get_close_matches(name.strip().lower(), known, 1, ALIKE):
+            raise InputError(f"{path}: unknown {what} '{name.strip()[:40]}'; call it '{near[0]}', or something quite different")
+    names = ", ".join(f"'{name.strip()[:40]}'" for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
+    warnings.warn(
+        f"{path}: {what}{'s' * (len(unknown) > 1)} {names} {'are' if unknown[1:] else 'is'} not known and ignored; "
+        f"known: {','.join(known)}",
+        stacklevel=4,
+    )

@@ -465,6 +465,8 @@ def read_fit(
     Errors: InputError naming file, sample and remedy.
     """
     path = Path(path)
+    if path.suffix == ".csv":
+        raise InputError(f"{path}: a table of loads lacks what a figure needs; write RESULT.json by estimate --out, and plot that")
     with reading(path):
         if not path.is_file():
             raise InputError(f"{path}: no such file; write it with torchrod estimate --out")

@@ -6,7 +6,6 @@ import math
 import re
 import warnings
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import IO
 
@@ -17,30 +16,30 @@ from torch import Tensor
 
 from ..mechanics.grid import on_rod
 from ..mechanics.robot import Robot
-from ..model.marker_geometry import at_origin, too_far, too_short
+from ..model.marker_geometry import against_chords, at_origin, misturned, too_far, too_short
 from ..util.errors import InputError
 from ..util.files import put, reading
 from ..util.units import metres_per
-from .csv_file import Table, read_table
+from .csv_file import Table, ignored, read_table
 from .npz_file import UNREADABLE, read_arrays, why
 from .shapes import KINDS, Kind, Of, Shapes
+from .tension_file import TENSION, read_tensions
 
 COLUMNS = ("sample", "time", "s", *(name for kind in KINDS for name in kind.columns))
 TENSION_EXAMPLES = ("tension_1", "tension_2")
 POSITIONS, OFFSETS = KINDS[0], KINDS[1]
-TENSION = re.compile(r"tension_\d+", re.ASCII)
 UNITS = re.compile(r"""\s*units\s*[=:]\s*["']?([^"']*?)["']?\s*""", re.IGNORECASE)
 SLACK = 0.05  # of the largest tension in the file: a load cell's zero may drift by so much
 UNIT_QUATERNION = 1e-2
-ALIKE = 0.85  # of difflib: one letter more or less in a word
+MOST_READINGS = 100_000_000  # of one kind, samples times places: gigabytes
 LEAST_COLUMNS = 2  # known ones, in a line that is a header
 
 
-def read_shapes(path: str | Path, robot: Robot, units: str | None = None) -> Shapes:
+def read_shapes(path: str | Path, robot: Robot, units: str | None = None, tensions: str | Path | None = None) -> Shapes:
     """Measurements from a CSV or NPZ file (docs/files.md), checked against the robot.
 
-    units: of its lengths, as metres_per takes it; by default what a remark of the file says, else metres. Errors: InputError naming
-    file and remedy.
+    units: of its lengths, as metres_per takes it; by default what a remark of the file says, else metres. tensions: a file of
+    tensions over time, from which those of every sample come by its time. Errors: InputError naming file and remedy.
     """
     path = Path(path)
     with reading(path):
@@ -59,25 +58,42 @@ def read_shapes(path: str | Path, robot: Robot, units: str | None = None) -> Sha
         raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
     if said := too_short(markers.s, L) or too_far(markers.markers(1.0), L):
         raise InputError(f"{path}: {said}")
-    T = len(robot.tendons)
+    T, cells = len(robot.tendons), path
+    if tensions is not None:
+        cells, markers = Path(tensions), with_tensions(path, markers, robot, tensions)
     if T and markers.tension is None:
-        raise InputError(f"{path}: tensions are missing; the robot has {T} tendons, add tension_1..tension_{T} (N)")
+        raise InputError(f"{path}: tensions are missing; the robot has {T} tendons, add tension_1..tension_{T} (N) or --tensions")
     given = 0 if markers.tension is None else markers.tension.shape[-1]
     if given != T:
         raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; give one per tendon, in N")
-    _check_pulls(path, markers, robot)
+    _check_pulls(cells, markers, robot)
     if bool(gap.any()):
         _warn_of_gaps(path, gap, markers.s)
     return replace(markers, s=markers.s.clamp(0, L))
 
 
+def with_tensions(path: Path, shapes: Shapes, robot: Robot, tensions: str | Path) -> Shapes:
+    """The shapes of a file with the tensions (N) of another, interpolated in time. Errors: InputError."""
+    if not len(robot.tendons):
+        raise InputError(f"{tensions}: the robot has no tendons; leave out --tensions, or add [[tendons]] to the robot")
+    if shapes.tension is not None:
+        raise InputError(f"{path}: has tensions of its own; leave out --tensions, or its columns tension_1, ..")
+    if shapes.time is None:
+        raise InputError(f"{path}: has no times, by which --tensions are found; add a column time (s)")
+    return replace(shapes, tension=read_tensions(tensions, len(robot.tendons)).at(shapes.time, path))
+
+
 def _check_rotations(path: Path, shapes: Shapes) -> None:
-    """Quaternions of length 1, to what a file rounds them to."""
+    """Quaternions of length 1, to what a file rounds them to, that go with the positions."""
     q = shapes.readings.get("orientations")
-    off = None if q is None else (q.norm(dim=-1) - 1).abs()
-    if q is not None and off is not None and bool((off > UNIT_QUATERNION).any()):
+    if q is None:
+        return
+    off = (q.norm(dim=-1) - 1).abs()
+    if bool((off > UNIT_QUATERNION).any()):
         size = float(q.norm(dim=-1)[off > UNIT_QUATERNION][0])
         raise InputError(f"{path}: qx,qy,qz,qw have the length {size:.3g}; a rotation is a unit quaternion, give it as such")
+    if said := misturned(lambda change: against_chords(shapes.s, shapes.positions, change(q), shapes.offsets)):
+        warnings.warn(f"{path}: {said}", stacklevel=3)
 
 
 def _scale(path: Path, asked: str | None, stated: str | None) -> float:
@@ -154,7 +170,7 @@ def _read_npz(path: Path, file: IO[bytes], units: str | None) -> Shapes:
     except UNREADABLE as error:
         raise InputError(f"{path}: is not an NPZ of plain numbers ({why(error)}); save numeric arrays only") from None
     if unknown := [key for key in data if key not in _expected(None, None)]:
-        _ignored(path, "array", unknown, list(_expected(None, None)))
+        ignored(path, "array", unknown, list(_expected(None, None)))
     data = {key: value for key, value in data.items() if key not in unknown}
     texts = {key: data.pop(key) for key in ("sample", "units") if key in data}
     for key, value in data.items():
@@ -194,19 +210,6 @@ def _further(found: dict[str, Tensor]) -> list[Kind]:
     return [kind for kind in KINDS if kind.name in found and kind not in (POSITIONS, OFFSETS)]
 
 
-def _ignored(path: Path, what: str, unknown: list[str], known: list[str]) -> None:
-    """Say once what is left aside; refuse what looks like a slip of the pen, which would lose a measurement."""
-    for name in unknown:
-        if near := get_close_matches(name.strip().lower(), known, 1, ALIKE):
-            raise InputError(f"{path}: unknown {what} '{name.strip()[:40]}'; call it '{near[0]}', or something quite different")
-    names = ", ".join(f"'{name.strip()[:40]}'" for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
-    warnings.warn(
-        f"{path}: {what}{'s' * (len(unknown) > 1)} {names} {'are' if unknown[1:] else 'is'} not known and ignored; "
-        f"known: {','.join(known)}",
-        stacklevel=4,
-    )
-
-
 # CSV.
 
 
@@ -240,6 +243,11 @@ def _read_csv(path: Path, file: IO[bytes], units: str | None) -> Shapes:
         _increasing(path, s[rows], None if offsets is None else offsets[rows], samples[which[rows[0]]])
     places, index = np.unique(s[:, None] if offsets is None else np.column_stack([s, offsets]), axis=0, return_inverse=True)
     index = index.reshape(-1)
+    if len(samples) * len(places) > MOST_READINGS:
+        raise InputError(
+            f"{path}: {len(samples)} samples have {len(places)} different places together, too many for one table; round s, or "
+            "give fewer samples in a file"
+        )
     found: dict[str, Tensor] = {}
     for kind in kinds:
         if kind.of is Of.MARKER:
@@ -275,7 +283,7 @@ def _check_header(path: Path, names: list[str]) -> tuple[list[Kind], list[str]]:
         if name in known and names.count(name) > 1:
             raise InputError(f"{path}: column '{name}' stands twice in the header; keep one of them")
     if unknown := [name for name in names if name not in known]:
-        _ignored(path, "column", unknown, [*COLUMNS, *TENSION_EXAMPLES])
+        ignored(path, "column", unknown, [*COLUMNS, *TENSION_EXAMPLES])
     kinds = []
     for kind in KINDS:
         there = [name for name in kind.columns if name in names]

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..util.errors import InputError, shown
 from ..util.files import reading
+from .npz_file import why
 
 MOST_WHOLE = 10**300  # a whole number beyond it has no float
 
@@ -19,7 +20,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         try:
             return tomllib.loads(path.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, or a path that is none
-            raise InputError(f"{path}: is not valid TOML ({error}); correct that place (docs/files.md has the keys)") from None
+            raise InputError(f"{path}: is not valid TOML ({why(error)}); correct that place (docs/files.md has the keys)") from None
 
 
 def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
@@ -28,7 +29,7 @@ def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
         raise InputError(f"{where} must be a table of keys; known keys: {', '.join(sorted(known))}")
     for key in value:
         if key not in known:
-            raise InputError(f"{where}: unknown key '{key}'; known keys: {', '.join(sorted(known))}")
+            raise InputError(f"{where}: unknown key {shown(key)}; known keys: {', '.join(sorted(known))}")
     return value
 
 

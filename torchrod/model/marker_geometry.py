@@ -1,11 +1,13 @@
 """What can be wrong with markers before any mechanics: their unit, their frame, their order. Asked of fits that explain nothing."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..mechanics.lie import rotate
 from .sensors import Markers
 
 UNITS = {1e6: "micrometres", 1e3: "millimetres", 1e2: "centimetres", 39.37: "inches"}
@@ -16,6 +18,12 @@ OFF = 0.1  # rod lengths: a marker that is so much farther from the origin than 
 NEAR_BASE = 0.3  # of the length: the markers that say which way the rod leaves the base
 AXES = [(sign, axis, f"{'+' if sign > 0 else '-'}{'xyz'[axis]}") for axis in range(3) for sign in (1.0, -1.0)]
 STRAIGHT = 0.85  # chord over arc of the rod up to a marker: one bent more may have turned by 60 degrees since the base
+AGAINST, ALONG = 0.2, 0.1  # `against_chords` of orientations that contradict positions; of others that do not, beside it
+MISTAKES: dict[str, Callable[[Tensor], Tensor]] = {  # in quaternions x, y, z, w, each with what mends it
+    "with w first": lambda q: q[..., [1, 2, 3, 0]],
+    "as the inverse rotation": lambda q: q * q.new_tensor([-1.0, -1.0, -1.0, 1.0]),
+    "as the inverse rotation with w first": lambda q: q[..., [1, 2, 3, 0]] * q.new_tensor([-1.0, -1.0, -1.0, 1.0]),
+}
 ASIDE = 0.87  # cosine of 30 degrees: so near an axis, the shape follows that one
 
 
@@ -70,7 +78,7 @@ def misplaced(markers: Markers, sample: int, length: float) -> str:
     if not len(s):
         return "No marker was seen: every position is empty or NaN."
     if len(s) == 1:
-        return "Only one marker was seen: a contact needs at least two."
+        return "Only one marker was seen: a contact needs at least two; for a tip force, try --contacts 0 --unknown-tip force."
     zero = (at_origin(markers)[sample]).nonzero().flatten()
     if len(zero):
         places = _named(zero.tolist(), markers.s)
@@ -134,3 +142,35 @@ def _leaves(z: Float[Tensor, "P 3"], s: Float[Tensor, " P"], length: float) -> s
         if name != "+z" and float(sign * way[axis]) > ASIDE:
             return f"The shape leaves the base along {name}, but the rod leaves it along +z: turn the base frame."
     return ""
+
+
+def against_chords(
+    s: Float[Tensor, " P"], p: Float[Tensor, "B P 3"], q: Float[Tensor, "B P 4"], r: Float[Tensor, "P 3"] | None = None
+) -> float:
+    """How far orientations (x, y, z, w) contradict positions (m, offset by r from the centre line): the mean of 1 - cos of the
+    angle between the chord from place to place, the base included, and the mean tangent of its ends. 0 where nothing was read.
+    """
+    centre = p if r is None else p - rotate(q, r.expand_as(p))
+    tangent = rotate(q, q.new_tensor([0.0, 0.0, 1.0]).expand_as(p))
+    if len(s) and float(s[0]) > 0:
+        centre = torch.cat([torch.zeros_like(centre[:, :1]), centre], 1)
+        tangent = torch.cat([tangent.new_tensor([0.0, 0.0, 1.0]).expand_as(tangent[:, :1]), tangent], 1)
+    chord, middle = centre.diff(dim=1), tangent[:, 1:] + tangent[:, :-1]
+    against = 1 - torch.nn.functional.cosine_similarity(chord, middle, dim=-1)
+    return float(against.nanmean().nan_to_num(0.0))
+
+
+def misturned(against: Callable[[Callable[[Tensor], Tensor]], float]) -> str:
+    """What is wrong with orientations, by `against_chords` of them after a change; mostly nothing."""
+    given = against(lambda q: q)
+    if given < AGAINST:
+        return ""
+    mended = {name: against(change) for name, change in MISTAKES.items()}
+    best = min(mended, key=mended.__getitem__)
+    if mended[best] > ALONG * given:
+        return ""
+    turned, left = (math.degrees(math.acos(max(-1.0, 1 - v))) for v in (given, mended[best]))
+    return (
+        f"the orientations do not go with the positions along the rod ({turned:.0f} degrees off), but read {best} they would "
+        f"({left:.0f} degrees): check their order, which is x, y, z, w, and that they turn the section into the base frame"
+    )

@@ -1,5 +1,6 @@
 """Files of measuring systems: one module for each, from the file to a `Recording`; `convert` makes it shapes by a layout."""
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,8 @@ FORMATS: dict[str, Callable[[Path, bytes, Layout], Recording]] = {
     "wide": wide.read,
 }
 
+TIMED = ("motive", "vicon", "trc", "c3d", "aurora")  # whose files always have times
+
 
 def read_recording(name: str, path: str | Path, layout: Layout) -> Recording:
     """A file of the measuring system of that name. Errors: InputError naming file and remedy."""
@@ -35,7 +38,23 @@ def read_recording(name: str, path: str | Path, layout: Layout) -> Recording:
         content = path.read_bytes()
     if not content:
         raise InputError(f"{path}: is empty; export it again")
-    return FORMATS[name](path, content, layout)
+    found = FORMATS[name](path, content, layout)
+    _warn_of_idle(name, path, layout, found)
+    return found
+
+
+def _warn_of_idle(name: str, path: Path, layout: Layout, found: Recording) -> None:
+    """Say of every key of the layout that has nothing to act on."""
+    here = f"in {path}, a file of format {name}"
+    idle = {
+        "time": layout.time is not None and name != "wide" and f"{here}, times are not in a column that has to be named",
+        "rate": layout.rate is not None and name in TIMED and f"frames {here}, have their own times",
+    }
+    keys = {"units": layout.units is not None, "up": layout.up != "z", "left_handed": layout.left_handed, "base": bool(layout.base)}
+    idle |= {key: given and not found.points and f"there are no positions {here}" for key, given in keys.items()}
+    for key, why in idle.items():
+        if why:
+            warnings.warn(f"{layout.path}: {key} has no effect: {why}", stacklevel=3)
 
 
 __all__ = ["FORMATS", "Imported", "Layout", "Recording", "convert", "read_layout", "read_recording"]

@@ -1,6 +1,7 @@
 """From a recording and its layout to shapes in the robot's base frame."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from torch import Tensor
 from ...mechanics.grid import on_rod
 from ...mechanics.lie import Matrix, product
 from ...mechanics.robot import Robot
-from ...util.errors import InputError
+from ...model.marker_geometry import against_chords, misturned
+from ...util.errors import InputError, shown
 from ...util.precision import DTYPE
 from ...util.units import metres_per
 from ..base_pose import BasePose
@@ -23,6 +25,7 @@ from .plate import Base, base_in, check_side, named
 from .recording import Recording
 
 ON_PLATE = 5e-3  # of the rod's length: so near a marker of the plate a point is that marker
+TOLD = 0.02  # of the markers in frames that have enough points: of something else that is no rod at all so many are labelled
 # Rotations of the file's world that make its axis `up` the z axis.
 UPRIGHT = {
     "z": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
@@ -50,7 +53,7 @@ def convert(path: Path, found: Recording, layout: Layout, robot: Robot, base: Ba
     frames = found.frames
     if not frames:
         raise InputError(f"{path}: holds nothing that the layout asks for; {named(found)}")
-    found = _in_metres(path, found, layout)
+    raw, found = found, _in_metres(path, found, layout)
     frame, pose = Base(torch.eye(3, dtype=DTYPE)[None], torch.zeros(1, 3, dtype=DTYPE)), base
     if layout.base is not None:
         frame = base_in(path, layout, layout.base, found)
@@ -60,6 +63,8 @@ def convert(path: Path, found: Recording, layout: Layout, robot: Robot, base: Ba
 
         frame = Base(roma.unitquat_to_rotmat(base.rotation)[None], base.position[None])
     shapes = [part for part in (_markers(path, found, layout, robot, frame), _bodies(path, found, layout, frame)) if part]
+    if layout.bodies is not None:
+        _check_rotations(path, raw, layout, frame)
     if layout.gratings is not None:
         shapes.append(_gratings(path, found, layout, layout.gratings))
     joined = _joined(shapes, frames)
@@ -109,7 +114,7 @@ def _into_base(p: Float[Tensor, "F N 3"], base: Base) -> Float[Tensor, "F N 3"]:
 
 def _points(path: Path, found: Recording, layout: Layout, what: str, names: list[str]) -> Float[Tensor, "F N 3"]:
     if missing := [name for name in names if name not in found.points]:
-        raise InputError(f"{layout.path}: {what}.names has {missing[0]!r}, which is not in {path}; {named(found)}")
+        raise InputError(f"{layout.path}: {what}.names has {shown(missing[0])}, which is not in {path}; {named(found)}")
     return torch.from_numpy(np.stack([found.points[name] for name in names], 1))
 
 
@@ -131,7 +136,14 @@ def _markers(path: Path, found: Recording, layout: Layout, robot: Robot, base: B
             seen = torch.where(on_plate.unsqueeze(-1), torch.nan, seen)
         every = _into_base(seen, base).numpy()
         p = torch.from_numpy(labelled(rod_of(robot, places.s.numpy(), offsets), every))
-        gone = int(torch.isnan(p[..., 0]).sum())
+        told = np.isfinite(p[..., 0].numpy())
+        enough = 2 * np.isfinite(every).all(-1).sum(-1) >= len(places.s)
+        if not enough.any() or told[enough].mean() < TOLD:
+            raise InputError(
+                f"{path}: in hardly any of its {len(p)} frames do points lie as markers on a rod would at the s of {layout.path}; "
+                "check s, units, up and the base frame"
+            )
+        gone = int((~told).sum())
         if gone:
             warnings.warn(
                 f"{path}: {gone} of {p[..., 0].numel()} markers are missing: no point could be told to be theirs", stacklevel=3
@@ -146,7 +158,9 @@ def _bodies(path: Path, found: Recording, layout: Layout, base: Base) -> Shapes 
     assert places.names is not None
     p = _into_base(_points(path, found, layout, "bodies", places.names), base)
     if missing := [name for name in places.names if name not in found.rotations]:
-        raise InputError(f"{layout.path}: bodies.names has {missing[0]!r}, which has no rotation in {path}; list it in [markers]")
+        raise InputError(
+            f"{layout.path}: bodies.names has {shown(missing[0])}, which has no rotation in {path}; list it in [markers]"
+        )
     q = torch.from_numpy(np.stack([found.rotations[name] for name in places.names], 1))
     back = _quaternion(base.R)[:, None] * torch.tensor([-1.0, -1.0, -1.0, 1.0], dtype=DTYPE)
     q = product(back.expand_as(q), q)
@@ -155,11 +169,28 @@ def _bodies(path: Path, found: Recording, layout: Layout, base: Base) -> Shapes 
     return Shapes(places.s, p, [""] * len(p), places.offsets, readings={"orientations": q})
 
 
+def _check_rotations(path: Path, raw: Recording, layout: Layout, base: Base) -> None:
+    """Say so where the rotations in the file, read in another way, would go with the positions."""
+
+    def against(change: Callable[[Tensor], Tensor]) -> float:
+        rotations = {name: change(torch.from_numpy(q)).numpy() for name, q in raw.rotations.items()}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of units, which has been said
+            read = _bodies(path, _in_metres(path, replace(raw, rotations=rotations), layout), layout, base)
+        assert read is not None
+        order = read.s.argsort()
+        offsets = None if read.offsets is None else read.offsets[order]
+        return against_chords(read.s[order], read.positions[:, order], read.readings["orientations"][:, order], offsets)
+
+    if said := misturned(against):
+        warnings.warn(f"{path}: {said}", stacklevel=3)
+
+
 def _gratings(path: Path, found: Recording, layout: Layout, places: Gratings) -> Shapes:
     """Curvature as it stands, or from the strains of cores: e = e_0 + k_x y - k_y x, least squares."""
     listed = [*places.kx, *places.ky, *(name for row in places.cores for name in row)]
     if missing := [name for name in listed if name not in found.values]:
-        raise InputError(f"{layout.path}: gratings names {missing[0]!r}, which is not in {path}; {named(found)}")
+        raise InputError(f"{layout.path}: gratings names {shown(missing[0])}, which is not in {path}; {named(found)}")
     if places.core is None:
         k = np.stack([np.stack([found.values[name] for name in names], 1) for names in (places.kx, places.ky)], -1)
     else:

@@ -8,7 +8,8 @@ robot unloaded), each assignment is refined by the clamped curve
 fitted to it, and the one that places most markers best is taken. From then on every marker is sought where it was, and (1) finds
 those that come back. Assignments are optimal for all markers together (scipy.optimize.linear_sum_assignment). A point that is
 farther from its place than half the distance between markers, or from its neighbour than the rod is long between them, is not
-taken: that marker is missing, not wrong.
+taken: that marker is missing, not wrong. A first frame takes a tenth of a second; where PATIENCE of them have failed, the next
+are tried ever more rarely, so that a file of something else ends soon, and a rod that was lost is missed at most twice as long.
 """
 
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ STRETCH = 1.02  # markers may be this much farther apart than the rod is long be
 CHORD, SHORT = 0.75, 0.35  # of the arc between markers is their distance at least, where it is at most so much of the length
 LOST = 0.6  # of the markers that were there: with fewer a frame is begun anew
 ABOUT = 0.3  # of the length: so far from the markers of a rod that is tried they may be
+PATIENCE = 8  # frames
 CRUMPLED = 10.0  # markers that a labelling is worth less where distances are not those along the rod, squared and summed
 
 Places = Float[np.ndarray, "P 3"]
@@ -152,25 +154,30 @@ def _begun(rod: Rod, points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " P"]:
 
 def labelled(rod: Rod, frames: Float[np.ndarray, "F N 3"]) -> Float[np.ndarray, "F P 3"]:
     """The markers of every frame, in the base frame, NaN where none of its points is the marker."""
-    result = np.full((len(frames), len(rod.s), 3), np.nan)
+    P, lost = len(rod.s), np.full(len(rod.s), -1)
+    result = np.full((len(frames), P, 3), np.nan)
+    reach = STRETCH * rod.s.max() + np.linalg.norm(rod.r, axis=-1).max() + rod.gate
     places: Places | None = None
-    known = np.zeros(len(rod.s), dtype=bool)
-    moving = np.zeros((len(rod.s), 3))  # from the frame before to this one
+    known = np.zeros(P, dtype=bool)
+    moving = np.zeros((P, 3))  # from the frame before to this one
+    failed, again = 0, 0  # how many frames more than not were no rod; from which frame on another may be tried as the first
     for k, frame in enumerate(frames):
         points = frame[np.isfinite(frame).all(-1)]
         if not len(points):
             continue
-        found = np.full(len(rod.s), -1) if places is None else _possible(rod, _assigned(places + moving, points, rod.gate), points)
+        found = lost if places is None else _possible(rod, _assigned(places + moving, points, rod.gate), points)
         if (found >= 0).sum() < max(1.0, LOST * known.sum()) or not known.any():
+            if k < again or 2 * (np.linalg.norm(points, axis=-1) <= reach).sum() < P:
+                continue
             found = _begun(rod, points)
         at = np.flatnonzero(found >= 0)
-        if not len(at):
-            places, known, moving = None, np.zeros(len(rod.s), dtype=bool), np.zeros_like(moving)
-            continue
         before = places
-        places = _curve(rod, at, points[found[at]])
-        at = at[np.linalg.norm(places[at] - points[found[at]], axis=-1) <= 2 * rod.gate]  # the others belong to no such curve
-        result[k, at] = places[at] = points[found[at]]
-        moving = np.zeros_like(moving) if before is None else places - before
-        known = np.isin(np.arange(len(found)), at)
+        places = _curve(rod, at, points[found[at]]) if len(at) else None
+        if places is not None:
+            at = at[np.linalg.norm(places[at] - points[found[at]], axis=-1) <= 2 * rod.gate]  # the others belong to no such curve
+            result[k, at] = places[at] = points[found[at]]
+        moving = np.zeros((P, 3)) if before is None or places is None else places - before
+        known = np.isin(np.arange(P), at)
+        failed = max(0, failed - 1) if len(at) else failed + 1
+        again = k + 2 ** max(0, failed - PATIENCE)
     return result

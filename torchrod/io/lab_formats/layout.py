@@ -153,6 +153,8 @@ def _plate(where: str, value: object) -> Plate:
         )
     if body is not None and not isinstance(body, str):
         raise InputError(f"{where}.body is {shown(body)}; it must be the name of a rigid body")
+    if moving and body is None:
+        raise InputError(f"{where}.moving is true, but a stated pose stays where it is; give body, or names and at of markers")
     return Plate(None, None, body, pose, moving)
 
 
@@ -166,6 +168,8 @@ def _gratings(where: str, value: object) -> Gratings:
             raise InputError(
                 f"{where} has {len(kx)} names in kx and {len(ky)} in ky for {G} arc lengths; give one of each for each s"
             )
+        if idle := sorted({"core", "cores", "start", "unit"} & set(table)):
+            raise InputError(f"{where}.{idle[0]} stands beside kx and ky, which are curvatures (1/m) already; keep one of them")
         return Gratings(s, kx, ky, [], None, None, unit)
     if "core" not in table or ("cores" in table) == ("start" in table):
         raise InputError(f"{where} needs kx and ky, or core_mm = [[x, y], ..] with cores = [[names], ..] or start_mm = [..]")
@@ -207,4 +211,6 @@ def read_layout(path: str | Path) -> Layout:
     left = _flag(f"{path}: left_handed", table.get("left_handed", False))
     if rate is not None and not math.isfinite(1 / rate):
         raise InputError(f"{path}: rate is {rate}; it must be in frames per second")
+    if rate is not None and time is not None:
+        raise InputError(f"{path}: time and rate both say when the frames are; give one of them")
     return Layout(path, units, up, left, time, rate, parts["base"], parts["markers"], parts["bodies"], parts["gratings"])

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ...util.errors import InputError
+from ...util.errors import InputError, shown
 from .layout import Layout
 from .recording import Recording
 from .text import Rows, numbers, rows_of, triplets, unused
@@ -17,10 +17,12 @@ def read(path: Path, content: bytes, layout: Layout) -> Recording:
     head = next((i for i, row in enumerate(rows) if [c.lower() for c in row[:2]] == ["frame", "time (seconds)"]), None)
     if head is None:
         table = numbers(path, rows, 0)
+        if table.shape[1] < 5:
+            raise InputError(f"{path}: has no header, and not frame, time, x, y, z in its lines; export it from Motive as CSV")
         return Recording(table[:, 1], triplets([], table, 2), units="m")
     said = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     if said.get("Rotation Type", "Quaternion").lower() != "quaternion":
-        raise InputError(f"{path}: has rotations as {said['Rotation Type']}; export it with quaternions")
+        raise InputError(f"{path}: has rotations as {shown(said['Rotation Type'])}; export it with quaternions")
     names, kinds = _labels(path, rows[:head], len(rows[head]))
     table = numbers(path, rows, head + 1, len(rows[head]))
     axes, points, rotations = [cell.upper() for cell in rows[head]], {}, {}

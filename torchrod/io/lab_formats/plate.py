@@ -4,8 +4,8 @@ Markers at places b_i of the base frame that were seen at z_i give the pose of l
 (Kabsch; roma.rigid_points_registration), for any rotation.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...mechanics.lie import Matrix, Vector, matvec
-from ...util.errors import InputError
+from ...util.errors import InputError, shown
 from .layout import Layout, Plate
 from .recording import Recording
 
 ALIKE = 0.02  # of the plate's size: so well its markers must fit it, and so well a mirrored plate must not
-MOST_TRIED = 2_000_000  # assignments of points to an unlabelled plate
+MOST_NAMED, MOST_LETTERS = 12, 40  # names in a refusal, and letters of each
+MOST_TRIED = 10_000  # triples of points that lie as the first three of an unlabelled plate
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def base_in(path: Path, layout: Layout, plate: Plate, found: Recording) -> Base:
         R, t, off = aligned(plate.at, z)
         return Base(R, t, float(off), (), z[0])
     if missing := [name for name in names if name not in found.points]:
-        raise InputError(f"{layout.path}: base.names has {missing[0]!r}, which is not in {path}; {named(found)}")
+        raise InputError(f"{layout.path}: base.names has {shown(missing[0])}, which is not in {path}; {named(found)}")
     z = torch.from_numpy(np.stack([found.points[name] for name in names], 1))
     if not plate.moving:
         z = z.nanmedian(0, keepdim=True).values
@@ -109,17 +110,33 @@ def _of_body(path: Path, plate: Plate, found: Recording) -> tuple[Matrix, Vector
     if plate.body is None:
         return own, plate.pose.position[None]
     if plate.body not in found.rotations:
-        known = ", ".join(found.rotations) or "none"
-        raise InputError(f"{path}: has no rigid body {plate.body!r} for the base; rigid bodies: {known}")
+        raise InputError(f"{path}: has no rigid body {shown(plate.body)} for the base; rigid bodies: {listed(found.rotations)}")
     q, p = (torch.from_numpy(of[plate.body]) for of in (found.rotations, found.points))
     turn = roma.unitquat_to_rotmat(torch.where(torch.isfinite(q), q, q.new_tensor([0.0, 0.0, 0.0, 1.0])))
     gone = ~torch.isfinite(q).all(-1)
     turn = torch.where(gone[:, None, None], torch.nan, turn)
     if not plate.moving:
         if bool(gone.all()):
-            raise InputError(f"{path}: the rigid body {plate.body!r} of the base was never seen; name markers of the plate instead")
+            raise InputError(
+                f"{path}: the rigid body {shown(plate.body)} of the base was never seen; name markers of the plate instead"
+            )
         turn, p = torch.as_tensor(roma.special_procrustes(turn[~gone].mean(0)))[None], p.nanmedian(0, keepdim=True).values
     return turn @ own, matvec(turn, plate.pose.position) + p
+
+
+def _alike(apart: Float[np.ndarray, "N N"], wanted: Float[np.ndarray, "M M"], slack: float) -> list[tuple[int, int, int]]:
+    """Three points that are as far apart as the first three markers of the plate, every way of naming them; MOST_TRIED and one more
+    at most.
+    """
+    near = [np.abs(apart - wanted[i, j]) <= slack for i, j in ((0, 1), (0, 2), (1, 2))]
+    for of in near:
+        np.fill_diagonal(of, False)
+    found: list[tuple[int, int, int]] = []
+    for i, j in np.argwhere(near[0]):
+        found += [(int(i), int(j), int(k)) for k in np.flatnonzero(near[1][i] & near[2][j])]
+        if len(found) > MOST_TRIED:
+            break
+    return found
 
 
 def _places_of_plate(path: Path, at: Float[Tensor, "M 3"], found: Recording) -> Float[np.ndarray, "M 3"]:
@@ -134,15 +151,14 @@ def _places_of_plate(path: Path, at: Float[Tensor, "M 3"], found: Recording) -> 
     frame = int((x & y & w).sum(axis=1).argmax())
     z = every[frame][(x & y & w)[frame]]
     M, places = len(at), at.numpy()
-    if len(z) < M or len(z) ** 3 > MOST_TRIED:
-        raise InputError(f"{path}: its {len(z)} points cannot be told apart as the base plate's {M} markers; give base.names")
     wanted = np.linalg.norm(places[:, None] - places, axis=-1)
     apart = np.linalg.norm(z[:, None] - z, axis=-1)
     slack = ALIKE * float(wanted.max())
+    triples = _alike(apart, wanted, slack)
+    if len(z) < M or len(triples) > MOST_TRIED:
+        raise InputError(f"{path}: its {len(z)} points cannot be told apart as the base plate's {M} markers; give base.names")
     fits = []
-    for first in permutations(range(len(z)), 3):
-        if np.abs(apart[np.ix_(first, first)] - wanted[:3, :3]).max() > slack:
-            continue
+    for first in triples:
         chosen = list(first)
         for k in range(3, M):
             off = np.abs(apart[:, chosen] - wanted[k, :k]).max(-1)
@@ -168,5 +184,10 @@ def _places_of_plate(path: Path, at: Float[Tensor, "M 3"], found: Recording) -> 
 
 def named(found: Recording) -> str:
     """The names that there are, as a refusal lists them."""
-    names = list(found.points) or list(found.values)
-    return f"names: {', '.join(names[:12])}{', ...' if len(names) > 12 else ''}"
+    return f"names: {listed(found.points or found.values)}"
+
+
+def listed(names: Iterable[str]) -> str:
+    """The first of them, or none."""
+    every = [name if len(name) <= MOST_LETTERS else f"{name[:MOST_LETTERS]}..." for name in names]
+    return ", ".join([*every[:MOST_NAMED], *(["..."] if len(every) > MOST_NAMED else [])]) or "none"

@@ -24,8 +24,8 @@ def read(path: Path, content: bytes, layout: Layout) -> Recording:
     points = triplets([*[""] * first, *(cell for name in names for cell in (name, "", ""))], table, first)
     points = {name: np.where((p == 0).all(-1, keepdims=True), np.nan, p) for name, p in points.items()}
     try:
-        rate = float(keys.get("FREQUENCY", ["0"])[0])
+        rate = float(keys.get("FREQUENCY", ["0"])[0]) if layout.rate is None else layout.rate
     except (ValueError, IndexError):
         rate = 0.0
-    time = table[:, 1] if first else np.arange(len(table)) / rate if rate > 0 else None
+    time = table[:, 1] if first and layout.rate is None else np.arange(len(table)) / rate if rate > 0 else None
     return Recording(time, points, units="mm")

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ...util.errors import InputError, shown
 
 Rows = list[list[str]]
-MOST_COLUMNS = 1_000_000
+MOST_CELLS, TIMES = 1_000_000, 20  # of a table, and beyond that of those that the file has: one long line makes no table
 
 
 def rows_of(path: Path, content: bytes) -> Rows:
@@ -48,6 +48,9 @@ def numbers(path: Path, rows: Rows, first: int, width: int | None = None, blank:
     if not lines:
         raise InputError(f"{path}: has no frames after its header; export it again")
     width = max(len(row) for _, row in lines) if width is None else width
+    if width * len(lines) > max(MOST_CELLS, TIMES * sum(len(row) for _, row in lines)):
+        longest = max(lines, key=lambda line: len(line[1]))
+        raise InputError(f"{path}: line {longest[0] + 1} has {len(longest[1])} cells, far more than the others; export it again")
     found = np.full((len(lines), width), math.nan)
     for k, (i, row) in enumerate(lines):
         cells = row[:width]

@@ -18,7 +18,7 @@ def read(path: Path, content: bytes, layout: Layout) -> Recording:
     end = next((i for i in range(head + 2, len(rows)) if not any(rows[i])), len(rows))  # the next section
     try:
         rate = float(rows[first + 1][0])
-    except ValueError:
+    except (ValueError, IndexError):
         raise InputError(f"{path}: the line after Trajectories must be the frame rate; export it from Nexus as ASCII") from None
     table = numbers(path, rows[:end], head + 2, len(rows[head]))
     units = next((cell for cell in rows[head + 1] if cell), None)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...util.errors import InputError
+from ...util.errors import InputError, shown
 from .layout import Layout
 from .recording import Recording
 from .text import numbers, rows_of
@@ -20,7 +20,7 @@ def read(path: Path, content: bytes, layout: Layout) -> Recording:
         raise InputError(f"{path}: has no frames under its header; give one line per frame")
     header = rows[0]
     if layout.time is not None and layout.time not in header:
-        raise InputError(f"{path}: has no column {layout.time!r}; columns: {', '.join(header)[:200]}")
+        raise InputError(f"{path}: has no column {shown(layout.time)}; columns: {', '.join(header)[:200]}")
     wanted = set(layout.names)
     columns = {name: i for i, name in reversed(list(enumerate(header)))}
     table = numbers(path, rows, 1, len(header))
