@@ -212,6 +212,12 @@ class Estimate:
             }.get(fate, "")
         return f"{self._outcome(sample)} {said}".strip()
 
+    @property
+    def messages(self) -> list[str]:
+        """Of every sample."""
+        usual = (self.status == int(Status.CONVERGED)) & self.accepted & ~self.unstable & (self.fate == int(Fate.USED))
+        return [Status.CONVERGED.message if fine else self.message(b) for b, fine in enumerate(usual.tolist())]
+
     def _outcome(self, sample: int) -> str:
         status = Status(int(self.status[sample]))
         if status is Status.CONVERGED and self.unstable[sample]:
