@@ -5,11 +5,8 @@ ROBOT.toml, unloaded.csv and loaded.csv, calibrates the robot from its unloaded 
 the loads of all others by `torchrod estimate`, once for each line of the table. Writes real_robot.md and real_robot.png.
 """
 
-import argparse
 import json
 import math
-import statistics
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -25,7 +25,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.estimation.load_profile import joined_profile
+from torchrod.estimation.load_profile import DRAWS, band_of_draws, joined_profile
 
 S20 = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 
@@ -64,6 +64,21 @@ def test_the_band_holds_the_truth():
     alone = load_profile(problem, fit.x[7:8], fit.covariance[7:8])
     assert alone is not None
     assert torch.allclose(alone.band[0], profile.band[7], rtol=1e-9, atol=1e-12)
+
+
+def test_the_band_of_draws_is_their_quantiles():
+    """Pointwise, for bells, near and far from their places, and for a series: against the density in double precision."""
+    s, generator = torch.linspace(0, 0.4, 31, dtype=torch.float64), torch.Generator().manual_seed(2)
+    for family in (GaussianCoordinates(2, 0.4, 1.0), FourierCoordinates(2, 0.4, 1.0)):
+        gamma = family.start() + 0.7 * torch.randn(3, DRAWS, family.size, generator=generator, dtype=torch.float64)
+        f = family.loads(gamma)[0].density(s)
+        assert f is not None
+        f = f[..., :2]
+        values = torch.cat([f, f.norm(dim=-1, keepdim=True)], -1).numpy()
+        expected = torch.from_numpy(np.moveaxis(np.quantile(values, [0.025, 0.975], axis=1), 0, -1))
+        found = band_of_draws(family, gamma, s)
+        assert found is not None
+        assert ((found - expected).abs() < 1e-5 * expected.abs().amax((1, 2, 3), keepdim=True)).all()
 
 
 def test_a_series_is_its_own_profile_and_points_have_none():

@@ -14,8 +14,7 @@ from functools import cache
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.optimize import brentq
-from scipy.special import chdtri, chndtr
+from scipy.special import chdtri, chndtrinc
 from torch import Tensor
 
 from ..mechanics.grid import on_rod
@@ -175,8 +174,7 @@ def load_bound(
 @cache
 def noncentrality() -> float:
     """lambda: a chi-square test with 2 degrees of freedom and FALSE_ALARM finds F^T J F = lambda with probability POWER; 15.44."""
-    threshold = float(chdtri(2, FALSE_ALARM))
-    return float(brentq(lambda size: 1 - chndtr(threshold, 2, size) - POWER, 1.0, 100.0))  # pyright: ignore[reportArgumentType]
+    return float(chndtrinc(float(chdtri(2, FALSE_ALARM)), 2, 1 - POWER))
 
 
 def seen_by(s: Float[Tensor, " P"], location: Float[Tensor, " B"], noise: float) -> Markers:

@@ -26,7 +26,7 @@ from ..util.progress import bar
 from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, noise_or_auto, positive, writable
 from .table import table
 
-MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 5 ms each
+MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
 ANGLE_NOISE = 0.01  # rad
 NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated

@@ -13,7 +13,7 @@ from ..util.files import reason
 
 def one_line(text: str) -> str:
     """The text with line ends, and whatever else does not print, written out: names and paths may hold them."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return text if text.isprintable() else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def tell(line: str) -> None:

@@ -93,6 +93,8 @@ def _lines(result: Estimate, samples: list[str], noise: Noise | None) -> list[st
     columns = "".join(f"{head:>{width}}" for head, width in zip(heads, widths, strict=True))
     lines = [f"{'sample':>8}  {'status':<13} {'ok':<4}{'load':>4}{columns}{'rms (mm)':>10}"]
     accepted, status, residual = result.accepted.tolist(), result.status.tolist(), result.rms_residual.tolist()
+    more = result.tip is not None or result.tension_std is not None or noise is not None
+    further = (result.outlier.any(-1) | more).tolist()
     for b, name in enumerate(samples):
         label, rms = Status(status[b]).label, f" {_rms(1e3 * residual[b]):>9}"
         head = f"{one_line(name):>8}  {label:<13} {'yes' if accepted[b] else 'no':<4}"
@@ -101,7 +103,7 @@ def _lines(result: Estimate, samples: list[str], noise: Noise | None) -> list[st
             lines.append(f"{head}{'-':>4}{none:>{widths[0]}}{'':>{sum(widths[1:])}}{rms}")
         for i, load in enumerate(loads.get(b, [])):
             lines.append(f"{'' if i else head:<28}{load}{rms}")
-        lines += _further(result, b, noise)
+        lines += _further(result, b, noise) if further[b] else []
     return lines
 
 

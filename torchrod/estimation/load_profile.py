@@ -5,6 +5,7 @@ in it: the first-order band, +-1.96 sqrt(J C J^T) with J = df/dgamma, is nearly 
 holds the truth there in 66 to 84 % of cases, not 95 (docs/trust.md).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -15,14 +16,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from ..mechanics.loads import GaussianLoads
 from ..model.load_families import LoadFamily
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
+from ..util.threads import one_thread
 
 NODES = 101
 DRAWS = 256  # half of them antithetic; a power of two
-CHUNK = 4  # samples drawn at a time: what is sorted stays in cache
+CHUNK = 8  # samples drawn at a time: what is sorted stays in cache
+FADED = -30.0  # exp(FADED) of a bell's height is nothing; much less would be denormal, which takes ten times as long
 LEVELS = (0.025, 0.975)
 
 
@@ -74,17 +78,37 @@ def _band(
     return _quantiles(family, family.moved(gamma.unsqueeze(1), step, std), s)
 
 
+def _values(family: LoadFamily, gamma: Float[Tensor, "b D g"], s: Float[Tensor, " S"]) -> Float[Tensor, "b 3 S D"]:
+    """f_x, f_y and |f| of every draw, in single precision, which is sorted in half the time."""
+    single = torch.float32
+    found = torch.zeros(len(gamma), 3, len(s), gamma.shape[1], dtype=single)
+    for load in family.loads(gamma):
+        if isinstance(load, GaussianLoads):  # the same as its density, with the draws innermost: a fifth of the time
+            for k in range(load.mu.shape[-1]):
+                a_x, a_y, c = (v[..., k].to(single).unsqueeze(1) for v in (*load.a.unbind(-1), load.c))
+                off = (s.unsqueeze(-1) - load.mu[..., k].unsqueeze(1)).to(single)
+                bell = off.square_().mul_(-c).clamp_(min=FADED).exp_().sub_(math.exp(FADED))
+                found[:, 0].addcmul_(a_x, bell)
+                found[:, 1].addcmul_(a_y, bell)
+        else:
+            f = load.density(s)
+            assert f is not None
+            found[:, :2] += f[..., :2].permute(0, 3, 2, 1)
+    x, y, size = found.unbind(1)
+    torch.mul(x, x, out=size).addcmul_(y, y).sqrt_()
+    return found
+
+
 def _quantiles(family: LoadFamily, gamma: Float[Tensor, "b D g"], s: Float[Tensor, " S"]) -> Float[Tensor, "b S 3 2"]:
     """Pointwise quantiles of f_x, f_y, |f| over DRAWS draws; linear between the order statistics."""
-    f = _density(family, gamma, s)
-    assert f is not None
-    values = torch.cat([f, f.norm(dim=-1, keepdim=True)], -1).movedim(1, -1).contiguous().numpy()
-    ordered = np.sort(values, -1)
+    ordered = _values(family, gamma, s).numpy()
+    ordered.sort(-1)
     ends = []
     for level in LEVELS:
         k, share = divmod(level * (DRAWS - 1), 1)
-        ends.append(ordered[..., int(k)] * (1 - share) + ordered[..., int(k) + 1] * share)
-    return torch.from_numpy(np.stack(ends, -1))
+        near = ordered[..., int(k) : int(k) + 2].astype(np.float64)
+        ends.append(near[..., 0] * (1 - share) + near[..., 1] * share)
+    return torch.from_numpy(np.stack(ends, -1)).transpose(1, 2).contiguous()
 
 
 def band_of_draws(family: LoadFamily, gamma: Float[Tensor, "B D g"], s: Float[Tensor, " S"]) -> Float[Tensor, "B S 3 2"] | None:
@@ -116,8 +140,9 @@ def load_profile(
         return None
     band = f.new_full((len(f), nodes, 3, 2), torch.nan)
     known = (torch.isfinite(gamma).all(-1) & torch.isfinite(C).flatten(1).all(-1)).nonzero().squeeze(-1)
-    for index in known.split(CHUNK):
-        band[index] = _band(family, gamma[index], C[index], s)
+    with one_thread():
+        for index in known.split(CHUNK):
+            band[index] = _band(family, gamma[index], C[index], s)
     return Profile(s, f, band)
 
 

@@ -224,6 +224,12 @@ class Estimate:
             }.get(fate, "")
         return f"{self._outcome(sample)} {said}".strip()
 
+    @property
+    def messages(self) -> list[str]:
+        """Of every sample."""
+        usual = (self.status == int(Status.CONVERGED)) & self.accepted & ~self.unstable & (self.fate == int(Fate.USED))
+        return [Status.CONVERGED.message if fine else self.message(b) for b, fine in enumerate(usual.tolist())]
+
     def _outcome(self, sample: int) -> str:
         status = Status(int(self.status[sample]))
         if status is Status.CONVERGED and self.unstable[sample]:
@@ -369,9 +375,11 @@ def _only(mask: Bool[Tensor, "..."]) -> Callable[[Tensor], Tensor]:
     return lambda value: torch.where(mask.reshape(*mask.shape, *[1] * (value.ndim - mask.ndim)), value, torch.nan)
 
 
-def _placed(problem: Problem) -> Bool[Tensor, "B K"]:
-    """Which of the rows that are positions were read."""
-    return problem.distances((problem.weights > 0).to(DTYPE)).abs().amax(-1) > 0
+def _read_only(problem: Problem) -> Callable[[Tensor], Tensor]:
+    """What leaves those of the rows that are positions and were read as they are and fills the others with NaN."""
+    if int(problem.seen.min()) == len(problem.groups):  # as a rule
+        return Tensor.contiguous
+    return _only(problem.distances((problem.weights > 0).to(DTYPE)).abs().amax(-1) > 0)
 
 
 def make_estimate(
@@ -415,7 +423,7 @@ def make_estimate(
         base_wrench=kept(state.base.of(x)),
         registration=kept(state.registration.of(x)) if state.registration.size else None,
         centre_line=kept(sums.line),
-        residual=_only(_placed(problem))(kept(problem.distances(rows))),
+        residual=_read_only(problem)(kept(problem.distances(rows))),
         row_residual=kept(rows),
         tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
         tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,

@@ -385,11 +385,12 @@ def estimate_each(
 
 def _followed(problem: Problem, fit: Estimate, settings: Settings) -> Estimate:
     """The fit, repeated with twice the steps as long as they move what is read; what even MOST_STEPS do not follow is said."""
-    bad = ~checks.follows(problem, fit.x, fit.status == int(Status.CONVERGED))
-    if not bool(bad.any()):
+    if checks.all_follow(problem, fit.x):
+        return fit
+    at = (~checks.follows(problem, fit.x, fit.status == int(Status.CONVERGED))).nonzero().squeeze(-1)
+    if not len(at):
         return fit
     solve = solver_of(replace(settings, restarts=(), basins=0))
-    at = bad.nonzero().squeeze(-1)
     part = problem.take(at)
     while len(at) and part.steps < checks.MOST_STEPS:
         part = part.with_steps(min(2 * part.steps, checks.MOST_STEPS))

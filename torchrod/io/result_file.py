@@ -142,8 +142,10 @@ def _solution(other: Solution) -> dict[str, object]:
     return {"chi2": other.chi2, "loads": loads, **tip}
 
 
-def _message(estimate: Estimate, diagnosis: Diagnosis | None, b: int) -> str:
-    return f"{estimate.message(b)} {'' if diagnosis is None else diagnosis.message(b)}".rstrip()
+def _messages(estimate: Estimate, diagnosis: Diagnosis | None) -> list[str]:
+    """What became of every sample, and what is wrong with it."""
+    said = estimate.messages
+    return said if diagnosis is None else [f"{text} {diagnosis.message(b)}".rstrip() for b, text in enumerate(said)]
 
 
 def _record(of: Columns, b: int, sample: str, message: str) -> dict[str, str]:
@@ -228,9 +230,9 @@ def _texts(
     parameters: Sequence[str],
 ) -> Iterator[str]:
     """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
-    of = _columns(estimate, space, drawn)
+    of, messages = _columns(estimate, space, drawn), _messages(estimate, diagnosis)
     for b, name in enumerate(samples):
-        record = _record(of, b, name, _message(estimate, diagnosis, b))
+        record = _record(of, b, name, messages[b])
         if time is not None:
             record["time_s"] = _numbers(time[b])
         if parameters:
@@ -323,8 +325,10 @@ def write_result(
         texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, seconds, intervals, parameters)
         put(path, lambda file: _stream(file, json.dumps(robot), texts))
         return
-    said, which = np.unique([_message(estimate, diagnosis, b) for b in range(len(samples))], return_inverse=True)
-    names = {"sample": np.array(samples), "robot": np.array(robot), "messages": said, "message": which}
+    texts = _messages(estimate, diagnosis)
+    place = {text: i for i, text in enumerate(sorted(set(texts)))}
+    names = {"sample": np.array(samples), "robot": np.array(robot), "messages": np.array(list(place))}
+    names["message"] = np.array([place[text] for text in texts])
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}

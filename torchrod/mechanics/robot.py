@@ -38,6 +38,8 @@ class Robot(Float64):
     @property
     def weightless(self) -> bool:
         """True where gravity plays no part."""
+        if not bool(self.gravity.any()):
+            return True
         return not bool((self.weight != 0).any() | (self.rod.masses[:, 1:] * self.gravity[..., None, :] != 0).any())
 
     @property

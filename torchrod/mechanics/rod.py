@@ -140,7 +140,10 @@ class Rod(Float64):
     @property
     def softest(self) -> float:
         """The least of the three stiffnesses in bending and torsion (N m^2), anywhere on the rod."""
-        return float(torch.linalg.eigvalsh(self.sampled_stiffness[1].detach())[..., 0].min())
+        K = self.sampled_stiffness[1].detach()
+        if K.ndim == 2 and not any((rows := K.tolist())[i][j] for i in range(3) for j in range(i)):
+            return min(rows[i][i] for i in range(3))  # of a round tube, say, without eigenvalues: every fit asks
+        return float(torch.linalg.eigvalsh(K)[..., 0].min())
 
     @property
     def sampled_stiffness(self) -> tuple[Float[Tensor, "... 3 3"], Float[Tensor, "... 3 3"]]:
@@ -163,7 +166,7 @@ class Rod(Float64):
     @property
     def straight(self) -> bool:
         """Whether u* is zero all along."""
-        return not bool((self.reference_curvature[:, 1:] != 0).any())
+        return not bool(self.reference_curvature[:, 1:].any())
 
     def length_beyond(self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """How long a piece (m) of mass_per_length weighs as much as the rod, without the masses on it, beyond s."""

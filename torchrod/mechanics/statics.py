@@ -8,6 +8,7 @@ not even that when no load keeps its direction in the base frame; this is the fo
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -58,7 +59,7 @@ def stage_table(robot: Robot, loads: tuple[Load, ...], tension: Float[Tensor, ".
 def grid_for(robot: Robot, loads: tuple[Load, ...], outputs: Float[Tensor, " P"], steps: int) -> Grid:
     """The grid that serves this robot, these loads and these output arc lengths (m)."""
     jumps = [b for b in (load.breakpoints() for load in loads) if b is not None]
-    leading = torch.broadcast_shapes(*(b.shape[:-1] for b in jumps)) if jumps else ()
+    leading = np.broadcast_shapes(*(b.shape[:-1] for b in jumps))  # torch's own imports sympy: half a second
     breakpoints = torch.cat([b.expand(*leading, -1) for b in jumps], -1) if jumps else None
     return make_grid(
         robot.rod.length,

@@ -73,13 +73,14 @@ def too_short(s: Float[Tensor, " P"], length: float) -> str:
 
 def misplaced(markers: Markers, sample: int, length: float) -> str:
     """What is wrong with the unit, frame or order of one sample's markers on a rod of this length (m); mostly nothing."""
-    seen = markers.present[sample]
-    z, s = markers.positions[sample][seen], markers.s[seen]
+    markers = markers.take(torch.tensor([sample]))
+    seen = markers.present[0]
+    z, s = markers.positions[0][seen], markers.s[seen]
     if not len(s):
         return "No marker was seen: every position is empty or NaN."
     if len(s) == 1:
         return "Only one marker was seen: a contact needs at least two; for a tip force, try --contacts 0 --unknown-tip force."
-    zero = (at_origin(markers)[sample]).nonzero().flatten()
+    zero = at_origin(markers)[0].nonzero().flatten()
     if len(zero):
         places = _named(zero.tolist(), markers.s)
         return f"{places} at exactly (0, 0, 0), which some programs write for a missing one: leave the cells empty, or NaN."

@@ -5,10 +5,17 @@ precision they came in.
 """
 
 from dataclasses import fields, is_dataclass
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...] | None:
+    """The fields of a dataclass; None for another type."""
+    return tuple(f.name for f in fields(kind)) if is_dataclass(kind) else None
 
 
 def key(value: Any) -> Any:
@@ -19,9 +26,9 @@ def key(value: Any) -> Any:
     if isinstance(value, Tensor):
         return value.dtype, tuple(value.shape), value.detach().contiguous().numpy().tobytes()
     if isinstance(value, tuple):
-        return tuple(map(key, value))
-    if is_dataclass(value):
-        return type(value), *(key(getattr(value, f.name)) for f in fields(value))
+        return tuple([key(v) for v in value])
+    if (names := _names(type(value))) is not None:
+        return type(value), *[key(getattr(value, name)) for name in names]
     try:
         hash(value)
     except TypeError:

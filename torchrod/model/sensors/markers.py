@@ -44,8 +44,9 @@ class Markers(Float64):
     @property
     def present(self) -> Bool[Tensor, "B P"]:
         """Which markers were seen."""
-        x, y, z = torch.isfinite(self.positions).unbind(-1)  # .all(-1) takes three times as long
-        return x & y & z
+        x, y, z = self.positions.unbind(-1)
+        some = x + y + z
+        return some - some == 0  # an eighth of the time of isfinite(positions).all(-1)
 
     @property
     def alike(self) -> bool:
