@@ -489,3 +489,28 @@ def test_a_known_weight_tells_the_stiffness(tmp_path, capsys):
         assert abs(row["after"] - truth) < 3 * row["std"] < 0.05 * truth, row
     assert found["accepted"]
     assert "without tension only the ratio" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        (STATED.replace("friction = 0.2", "fricton = 0.2"), [], "uncertainty.shared: unknown key 'fricton'"),
+        (STATED.replace("friction = 0.2", "friction = -0.2"), [], "uncertainty.shared: friction is -0.2"),
+        (STATED.replace("friction = 0.2", "curvature = 0.2"), [], "uncertainty.shared: unknown key 'curvature'"),
+        (STATED, ["--free", "frition"], "frition is nothing that is calibrated; it must be one of"),
+        (STATED, ["--contacts", "-1"], "--contacts is -1"),
+        (STATED + '[calibration]\nparameters = ["friction_1"]\nvalues = []\ncovariance = [[1]]\n', [], "calibration.values"),
+        (STATED + '[calibration]\nparameters = ["friction_1"]\nvalues = [0]\ncovariance = [[-1]]\n', [], "calibration"),
+        (STATED + '[calibration]\nparameters = ["friction_9"]\nvalues = [0.1]\ncovariance = [[1]]\n', [], "no friction_9"),
+        (STATED + '[calibration]\nparameters = "friction_1"\n', [], "calibration.parameters"),
+        (STATED + "[calibration]\nmarkers = [[0.3, 0, 0, 0, 1e-3]]\n", [], "the marker at s = 0.2 m was not calibrated"),
+    ],
+)
+def test_bad_keys_are_one_line(tmp_path, capsys, monkeypatch, text, options, words):
+    monkeypatch.chdir(tmp_path)
+    Path("robot.toml").write_text(text)
+    Path("shapes.csv").write_text(SLACK)
+    assert main(["calibrate", "robot.toml", "shapes.csv", *options]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err, captured.err
+    assert captured.err.count("\n") == 1, captured.err

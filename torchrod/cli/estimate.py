@@ -28,6 +28,10 @@ from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
 ANGLE_NOISE = 0.01  # rad
+EXACT = (
+    "The robot is taken as exact: tensions, friction, stiffness, base frame. What is only nearly known passes for a load; "
+    "state it under [uncertainty] of ROBOT.toml, or calibrate it."
+)
 NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
 
@@ -89,6 +93,7 @@ def _warn_of_idle(options: Namespace, robot: Robot, shapes: Shapes) -> None:
         "--curvature-noise": options.curvature_noise is not None and lacks.get("curvature"),
         "--base-noise": options.base_noise is not None and lacks.get("base_wrench"),
         "--tension-std": options.tension_std is not None and not len(robot.tendons) and f"{options.robot} has no tendons",
+        "hung_kg": "hung" in shapes.readings and "known weights are for torchrod calibrate; here they are found like any load",
         "--load-prior": options.load_prior != "contact" and options.contacts == "0" and "--contacts 0 leaves no load",
         "--intervals sampled": options.intervals == "sampled" and _unused_intervals(options, whole),
         "--profile on": options.profile == "on" and not whole and "only RESULT.json and RESULT.npz have profiles (--out)",
@@ -170,6 +175,8 @@ def estimate(options: Namespace) -> None:
         raise InputError(f"{options.shapes}: {error}") from None
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
+    if len(robot.tendons) and problem.unknowns.uncertainty is None and not problem.state.tension.size:
+        print(EXACT)  # noqa: T201
     if options.out:
         said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
         nearly = problem.unknowns.uncertainty

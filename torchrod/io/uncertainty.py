@@ -23,6 +23,7 @@ from .values import as_number, as_numbers, as_rows, as_table, in_si, read_toml
 
 FRAME, SHARED = "frame", "shared"
 KEYS = {*KINDS, FRAME}
+OF_A_SAMPLE = {"curvature", "curvature_length", "metric"}  # another in every sample, and nothing that is calibrated
 CALIBRATION_KEYS = {"parameters", "values", "covariance", "noise", "markers"}
 LENGTHS, ANGLES = {"curvature_length", "tendon_place"}, {"gravity"}
 MARKER_ROW = 5  # s, x, y, z, std
@@ -113,12 +114,12 @@ def uncertainty_of(path: Path, content: dict[str, Any]) -> NearlyKnown:
     where = f"{path}: uncertainty"
     table = as_table(where, in_si(where, content["uncertainty"], LENGTHS, ANGLES), KEYS | {SHARED})
     own = _stated(where, {key: value for key, value in table.items() if key != SHARED})
-    shared = _stated(f"{where}.{SHARED}", table[SHARED]) if SHARED in table else (None, None)
+    shared = _stated(f"{where}.{SHARED}", table[SHARED], KEYS - OF_A_SAMPLE) if SHARED in table else (None, None)
     return NearlyKnown(*own, *shared, calibrated)
 
 
-def _stated(where: str, content: object) -> tuple[Uncertainty | None, Registration | None]:
-    table = as_table(where, in_si(where, content, LENGTHS, ANGLES), KEYS)
+def _stated(where: str, content: object, known: set[str] = KEYS) -> tuple[Uncertainty | None, Registration | None]:
+    table = as_table(where, in_si(where, content, LENGTHS, ANGLES), known)
     values: dict[str, Any] = {name: as_number(f"{where}.{name}", value) for name, value in table.items() if name != FRAME}
     try:
         stated = Uncertainty(**values)
