@@ -1,8 +1,8 @@
 """A real tendon robot, by the shipped commands: python scripts/real_robot.py DATA.json [--out docs].
 
 DATA.json: unloaded shapes, singles and doubles of a public tendon robot (docs/real_robot.md says which, and its conventions).
-Writes ROBOT.toml, unloaded.csv and loaded.csv, calibrates the robot from its unloaded shapes alone by `torchrod calibrate`, and estimates
-the loads of all others by `torchrod estimate`, once for each line of the table. Writes real_robot.md and real_robot.png.
+Writes ROBOT.toml, unloaded.csv and loaded.csv, calibrates the robot from its unloaded shapes alone by `torchrod calibrate`, and
+estimates the loads of all others by `torchrod estimate`, once for each line of the table. Writes real_robot.md and real_robot.png.
 """
 
 import argparse

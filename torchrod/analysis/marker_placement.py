@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mechanics.robot import Robot
+from ..model.uncertainty import Uncertainty
 from ..model.unknowns import Registration
 from ..util.precision import DTYPE
 from .observability import around, check, covariance, held, places, push_problem, pushed, seen_by, sensitivity
@@ -76,11 +77,12 @@ def _information(
     registration: Registration | None,
     directions: int,
     steps: int,
+    uncertainty: Uncertainty | None,
 ) -> tuple[Float[Tensor, "C B m m"], Float[Tensor, "m m"]]:
     """A_i of (1) for every candidate and push, and `held`. Pushes without an equilibrium are left out."""
     at = places(robot, PLACES, nearest).repeat_interleave(directions)
     F = force * around(directions)[1].repeat(PLACES, 1)
-    problem = push_problem(robot, seen_by(candidates, at, noise), tension, registration, steps)
+    problem = push_problem(robot, seen_by(candidates, at, noise), tension, registration, steps, uncertainty)
     J = sensitivity(problem, pushed(problem, F, at), KNOWN)[:, : len(candidates)] / noise
     solved = torch.isfinite(J).flatten(1).all(-1)
     if not bool(solved.any()):
@@ -124,11 +126,13 @@ def place(
     gap: float | None = None,
     directions: int = 8,
     steps: int = 0,
+    uncertainty: Uncertainty | None = None,
 ) -> Placement:
     """Propose `count` markers for pushes of `force` (N) from `nearest` (m; 10 % of L) to the tip, in every direction.
 
     noise: standard deviation of a marker coordinate (m). tension: readings (N). gap: least distance of two markers (m; 2 % of L, or
-    the even spacing if that is less). Starts from the even layout and is never worse. Errors: ValueError for what does not fit.
+    the even spacing if that is less). uncertainty: what is only nearly known of the robot. Starts from the even layout and is never
+    worse. Errors: ValueError for what does not fit.
     """
     L = robot.rod.length
     even = even_layout(robot, count)
@@ -142,6 +146,6 @@ def place(
     candidates = torch.cat([even, even_layout(robot, CANDIDATES)]).sort().values
     candidates = candidates[torch.cat([torch.tensor([True]), candidates.diff() > 1e-9 * L])]
     start = (candidates.unsqueeze(0) - even.unsqueeze(-1)).abs().argmin(-1)
-    A, known = _information(robot, candidates, noise, force, nearest, tension, registration, directions, steps)
+    A, known = _information(robot, candidates, noise, force, nearest, tension, registration, directions, steps, uncertainty)
     layout, history = _exchange(A, known, candidates, start, gap)
     return Placement(candidates[layout].sort().values, even, nearest, L * torch.tensor(history, dtype=DTYPE))

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from scipy.special import chdtri, chndtrinc
 from torch import Tensor
 
+from ..estimation.evaluator import evaluator
 from ..mechanics.grid import on_rod
 from ..mechanics.loads import PointForces
 from ..mechanics.robot import Robot
@@ -24,6 +25,7 @@ from ..mechanics.statics import solve_shape
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import TIP_ROWS, Problem
 from ..model.sensors import Markers
+from ..model.uncertainty import Uncertainty
 from ..model.unknowns import Registration, Unknowns
 from ..util.precision import DTYPE, as_float64
 
@@ -61,14 +63,15 @@ def push_problem(
     tension: Float[Tensor, "*B T"] | None = None,
     registration: Registration | None = None,
     steps: int = 0,
+    uncertainty: Uncertainty | None = None,
 ) -> Problem:
     """The estimator's problem of one contact, without a prior on it; tensions (N) of every sample or of all.
 
-    steps: 0 takes as many as the reference shape asks for.
+    steps: 0 takes as many as the reference shape asks for. uncertainty: what is only nearly known of the robot.
     """
     loads = GaussianCoordinates(1, robot.rod.length, robot.rod.force_scale, "none")
     tension = None if tension is None else tension.expand(len(markers.positions), -1)
-    return Problem(robot, Unknowns(loads, registration=registration), [markers], tension, steps)
+    return Problem(robot, Unknowns(loads, registration=registration, uncertainty=uncertainty), [markers], tension, steps)
 
 
 def places(robot: Robot, count: int, nearest: float | None = None) -> Float[Tensor, " K"]:
@@ -110,7 +113,7 @@ def sensitivity(problem: Problem, x: Float[Tensor, "B n"], unknown: tuple[int, .
     rows, g, base = [], problem.state.loads.size, problem.state.base.at
     for first in range(0, len(x), CHUNK):
         index = torch.arange(first, min(first + CHUNK, len(x)))
-        _, H = problem.take(index).linearized(x[index])
+        _, H = evaluator(problem.take(index)).linearized(x[index])
         # mu = L S(eta), so d(mu / L)/d(eta) = t (1 - t).
         t = torch.sigmoid(x[index, 2])
         H = torch.cat([H[..., :2], H[..., 2:3] / (t * (1 - t))[:, None, None], H[..., 3:]], -1)
@@ -121,8 +124,10 @@ def sensitivity(problem: Problem, x: Float[Tensor, "B n"], unknown: tuple[int, .
 
 
 def held(problem: Problem, unknown: tuple[int, ...]) -> Float[Tensor, "m m"]:
-    """What (1) adds to the information: the estimator's weak prior on zeta, nothing on the load."""
-    return torch.diag(torch.cat([torch.zeros(len(unknown), dtype=DTYPE), problem.state.registration.precision]))
+    """What (1) adds to the information: the estimator's prior on parameters and on zeta, nothing on the load."""
+    state = problem.state
+    beside = state.precision[state.loads.at.stop : state.base.at.start]
+    return torch.diag(torch.cat([torch.zeros(len(unknown), dtype=DTYPE), beside]))
 
 
 def covariance(A: Float[Tensor, "*B m m"]) -> tuple[Float[Tensor, "*B m m"], Bool[Tensor, "*B"]]:
@@ -153,16 +158,17 @@ def load_bound(
     registration: Registration | None = None,
     width_known: bool = True,
     steps: int = 0,
+    uncertainty: Uncertainty | None = None,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
     """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, by (1).
 
     force: N, section frame, not zero; location: m, inside the rod; base_wrench: N, N m, in equilibrium with the push; tension: N.
     Markers count with their noise where their positions are finite; the numbers play no part. registration: what is known of a base
-    frame that is unknown.
+    frame that is unknown; uncertainty: what is only nearly known of the robot.
     A bound is inf where the markers do not show the push, NaN where the base wrench is.
     """
     force, location, base_wrench = as_float64(force), as_float64(location), as_float64(base_wrench)
-    problem = push_problem(robot, markers, tension, registration, steps)
+    problem = push_problem(robot, markers, tension, registration, steps, uncertainty)
     unknown = (0, 1, 2) if width_known else (0, 1, 2, 3)
     C, singular = _bounded(problem, state(problem, force, location, base_wrench), unknown)
     along = force / force.norm(dim=-1, keepdim=True)
@@ -231,11 +237,13 @@ def bounds(
     width_known: bool = True,
     directions: int = 8,
     steps: int = 0,
+    uncertainty: Uncertainty | None = None,
 ) -> Observability:
     """What markers at s (m) with this noise (m) see of a push at every place (m; 60 from 2 % of L to the tip) and direction.
 
     force: its magnitude (N) for the bounds. tension: readings of the tendons (N). Localizable: the smallest force at which the
     location's standard deviation is 5 % of L, on a ladder that turns the rod by 0.02 to 1.62 rad at the push (F s^2 / 2 EI).
+    registration, uncertainty: what is known of a base frame that is unknown, and of a robot that is only nearly known.
     Errors: ValueError for markers, force, noise or tensions that do not fit the robot.
     """
     check(robot, s, noise, force, tension)
@@ -246,15 +254,16 @@ def bounds(
     def stds(size: Float[Tensor, " K"]) -> tuple[Float[Tensor, "K D"], Float[Tensor, "K D"]]:
         where, F = at.repeat_interleave(directions), (size[:, None, None] * e).flatten(0, 1)
         markers = seen_by(s, where, noise)
-        problem = push_problem(robot, markers, tension, registration, steps)
+        problem = push_problem(robot, markers, tension, registration, steps, uncertainty)
         wrench = problem.state.base.of(pushed(problem, F, where))
-        found = load_bound(robot, markers, F, where, wrench, tension, registration, width_known, steps)
+        found = load_bound(robot, markers, F, where, wrench, tension, registration, width_known, steps, uncertainty)
         return found[0].reshape(K, -1), found[1].reshape(K, -1)
 
     place, magnitude = stds(torch.full_like(at, force))
     ladder = torch.stack([2 * robot.rod.bending_stiffness * bend / at**2 for bend in BENDS])
     localizable = _localizable(ladder, torch.stack([stds(rung)[0] for rung in ladder]), LOCALIZED * robot.rod.length)
-    detectable = _detectable(push_problem(robot, seen_by(s, at, noise), tension, registration, steps), at, e)
+    nothing = push_problem(robot, seen_by(s, at, noise), tension, registration, steps, uncertainty)
+    detectable = _detectable(nothing, at, e)
     return Observability(force, at, angle, place, magnitude, detectable, localizable)
 
 

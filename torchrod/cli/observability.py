@@ -2,6 +2,9 @@
 
 import math
 import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -10,8 +13,9 @@ from torch import Tensor
 
 from ..analysis.marker_placement import Placement, even_layout, place
 from ..analysis.observability import BENDS, LOCALIZED, Observability, bounds
-from ..io import read_robot, write_observability, write_observability_table
+from ..io import read_robot, read_uncertainty, write_observability, write_observability_table
 from ..mechanics.robot import Robot
+from ..model.uncertainty import KINDS, Uncertainty
 from ..model.unknowns import Registration
 from ..util.errors import InputError
 from ..util.precision import DTYPE
@@ -34,19 +38,32 @@ def observability(options: Namespace) -> None:
     writable(options.out, FIGURE_SUFFIXES)
     writable(options.csv, (".csv",))
     writable(options.json, (".json",))
+    nearly = read_uncertainty(options.robot)
+    registration, uncertainty = _registration(options) or nearly.frame_of_a_sample, nearly.of_a_sample
     placed = None
     if options.place is not None:
         try:
             placed = place(
-                robot, options.place, options.noise, force, tension, _registration(options), options["from"], options.gap
+                robot,
+                options.place,
+                options.noise,
+                force,
+                tension,
+                registration,
+                options["from"],
+                options.gap,
+                uncertainty=uncertainty,
             )
         except ValueError as error:
             raise InputError(f"{options.robot}: {error}") from None
         s = placed.s
-    seen = bounds(robot, s, options.noise, force, tension=tension, registration=_registration(options))
+    asked = partial(bounds, robot, noise=options.noise, force=force, tension=tension, registration=registration)
+    seen = asked(s, uncertainty=uncertainty)
     if bool(torch.isnan(seen.location_std).all()):
         raise InputError(f"--force {force:g}: no equilibrium was found under it anywhere along the rod; check its size and units")
     print(_report(robot, seen, s, options, placed))  # noqa: T201
+    if uncertainty is not None:
+        print(_worth(seen, uncertainty, lambda left: asked(s, uncertainty=left)))  # noqa: T201
     _warn(seen)
     if options.csv:
         write_observability_table(options.csv, seen)
@@ -54,7 +71,7 @@ def observability(options: Namespace) -> None:
         pulled = [] if tension is None else tension.tolist()
         write_observability(options.json, seen, s.tolist(), robot.name, options.noise, pulled, options.registration, placed)
     if options.out:
-        _draw(options, robot, seen, s, tension, placed)
+        _draw(options, robot, seen, s, placed, lambda layout: asked(layout, uncertainty=uncertainty))
 
 
 def _registration(options: Namespace) -> Registration | None:
@@ -137,6 +154,19 @@ def _report(robot: Robot, seen: Observability, s: Tensor, options: Namespace, pl
     return "\n".join(lines)
 
 
+def _worth(seen: Observability, uncertainty: Uncertainty, of: Callable[[Uncertainty], Observability]) -> str:
+    """What knowing one kind of parameter exactly would do to the spread of a push's place."""
+    kinds = [kind for kind in KINDS if kind != "curvature_length" and getattr(uncertainty, kind)]
+    kinds += ["found"] if uncertainty.found is not None else []
+    now, lines = seen.location_std.nanmedian(), []
+    for kind in kinds:
+        left = of(replace(uncertainty, **{kind: None if kind == "found" else 0.0})).location_std.nanmedian()
+        name = "what was calibrated" if kind == "found" else kind.replace("_", " ")
+        lines.append((float(1 - left / now), name))
+    said = ", ".join(f"{name} {100 * share:.0f} %" for share, name in sorted(lines, reverse=True))
+    return f"spread of the location that would go if this were known exactly (median over places and directions): {said}"
+
+
 def _warn(seen: Observability) -> None:
     """Say where there is nothing to say."""
     lost = int(torch.isnan(seen.location_std).any(-1).sum())
@@ -145,15 +175,19 @@ def _warn(seen: Observability) -> None:
 
 
 def _draw(
-    options: Namespace, robot: Robot, seen: Observability, s: Tensor, tension: Tensor | None, placed: Placement | None
+    options: Namespace,
+    robot: Robot,
+    seen: Observability,
+    s: Tensor,
+    placed: Placement | None,
+    of: Callable[[Tensor], Observability],
 ) -> None:
     from ..plotting.observability import Layout, draw_observability
 
     layouts = [Layout("proposed" if placed else "markers", s, seen)]
     if placed is not None:
-        even = bounds(robot, placed.even, options.noise, seen.force, tension=tension, registration=_registration(options))
-        layouts.append(Layout("evenly spaced", placed.even, even))
+        layouts.append(Layout("evenly spaced", placed.even, of(placed.even)))
     title = f"{robot.name}: {len(s)} markers, {1e3 * options.noise:g} mm noise"
-    title += f", tendons at {', '.join(f'{t:g}' for t in options.tension)} N" if tension is not None else ""
+    title += f", tendons at {', '.join(f'{t:g}' for t in options.tension)} N" if options.tension else ""
     title += ", base frame unknown" if options.registration else ""
     draw_observability(options.out, layouts, robot.rod.length, title, None if placed is None else placed.nearest)
