@@ -7,13 +7,14 @@ import pytest
 import roma
 import torch
 
-from tests.problems import posed
+from tests.problems import posed, unknowns_of
 from tests.robots import T, steel_rod
 from tests.study import study1
 from torchrod import (
     FourierCoordinates,
     GaussianCoordinates,
     InputError,
+    Markers,
     Origin,
     PaperCoordinates,
     PointCoordinates,
@@ -289,3 +290,13 @@ def test_a_start_is_handed_out_chunk_by_chunk(monkeypatch):
     assert torch.allclose(again.force, whole.force, rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match=r"start.x has shape \(6, 10\)"):
         estimate(problem, start=start.take(torch.arange(6)))
+
+
+def test_no_interval_of_a_place_leaves_the_rod():
+    """A faint push near the tip, whose place is hardly known."""
+    rod, s = steel_rod(), torch.linspace(0.1, 0.4, 4)
+    push = PointForces(T([[[0.02, 0.0, 0.0]]]), T([[0.38]]))
+    p = solve_shape(rod, (push,), None, s, 1).p
+    fit = estimate(Problem(rod, unknowns_of(rod), [Markers(s, p, 2e-3)]))
+    assert float(fit.location_std) > 0.01
+    assert float(fit.location_interval[0, 0, 0]) < float(fit.location_interval[0, 0, 1]) <= rod.rod.length

@@ -117,7 +117,7 @@ class Estimate:
     groups, as the normal distribution has it. dof (B,), accepted: chi2 below its 99.9 % point; a sample may have converged to a fit
     that does not explain the data. coarse (B,): steps that were refined as far as they go do not follow the load; unstable (B,): no
     rod stays in the equilibrium that was found unless what pushes also holds it. Neither is accepted, but for an unstable one where
-    something pushes.
+    something pushes. rod_length (B,): m, beyond which no location lies.
     """
 
     x: Float[Tensor, "B n"]
@@ -153,6 +153,7 @@ class Estimate:
     fate: Int[Tensor, " B"]
     coarse: Bool[Tensor, " B"]
     unstable: Bool[Tensor, " B"]
+    rod_length: Float[Tensor, " B"]
 
     @property
     def warm_started(self) -> Bool[Tensor, " B"]:
@@ -205,8 +206,8 @@ class Estimate:
 
     @property
     def location_interval(self) -> Float[Tensor, "B K 2"]:
-        """95 % interval of the location (m)."""
-        return _interval(self.location, self.location_std)
+        """95 % interval of the location (m), on the rod."""
+        return _interval(self.location, self.location_std).minimum(self.rod_length[:, None, None])
 
     @property
     def rms_residual(self) -> Float[Tensor, " B"]:
@@ -442,4 +443,5 @@ def make_estimate(
         fate=torch.zeros_like(origin),
         coarse=torch.zeros_like(status, dtype=torch.bool),
         unstable=torch.zeros_like(status, dtype=torch.bool),
+        rod_length=x.new_full((len(x),), problem.robot.rod.length),
     )
