@@ -27,6 +27,8 @@ from torchrod import (
     Tendons,
     Uncertainty,
     Unknowns,
+    analyze,
+    contact_hypotheses,
     estimate,
     solve_shape,
 )
@@ -45,6 +47,15 @@ with the deviation stated under `[uncertainty]`. With {cases} cases a share of 9
 | what is off | noise (% of L) | exact: accepted | force / place (%) | stated: accepted | force / place (%) | error of place (mm) |
 |---|---|---|---|---|---|---|
 """
+CONTACTS = """
+## Whether anything pushes
+
+The same with `--contacts auto`, {cases} cases a row, first without a push, then with one of 0.5 to 1 force scale. Found: shapes
+with an accepted contact whose 95 % interval of the force excludes zero. Of pushed shapes: found / counted as one / of those, the
+interval of the place holds (%).
+
+| what is off | noise (% of L) | no push, exact: found (%) | stated: found (%) | push, exact | stated |
+|---|---|---|---|---|---|"""
 
 
 @dataclass(frozen=True)
@@ -133,8 +144,8 @@ def rows() -> list[Row]:
     return found
 
 
-def measured(row: Row, noise: float, cases: int) -> str:
-    """The row of the table."""
+def shapes_of(row: Row, noise: float, cases: int, pushed: bool) -> tuple[Markers, Reading, Tensor, Tensor]:
+    """Markers and tensions of as many shapes, each of a robot of its own, and the size (N) and place (m) of its push."""
     g, robot = torch.Generator().manual_seed(SEED), row.robot
     size = robot.rod.force_scale * (0.5 + 0.5 * torch.rand(cases, 1, generator=g, dtype=torch.float64))
     turn = 2 * math.pi * torch.rand(cases, 1, generator=g, dtype=torch.float64)
@@ -146,19 +157,51 @@ def measured(row: Row, noise: float, cases: int) -> str:
     shapes = []
     for b in range(cases):
         own, readings = row.change(robot, None if tension is None else tension[b : b + 1], g)
-        shapes.append(solve_shape(own, (load.take(torch.tensor([b])),), readings, s, 1).p)
+        shapes.append(solve_shape(own, (load.take(torch.tensor([b])),) if pushed else (), readings, s, 1).p)
     p = torch.cat(shapes)
     if row.frame is not None and row.frame.shift_std is not None and row.frame.turn_std is not None:
         zeta = torch.cat([_normal(g, row.frame.shift_std, cases, 3), _normal(g, row.frame.turn_std, cases, 3)], -1)
         p = move(zeta, p)
     p = p + _normal(g, noise * LENGTH, *p.shape)
+    return Markers(s, p, noise * LENGTH), tension, size, place
 
-    def fitted(stated: Uncertainty | None, frame: Registration | None) -> tuple[str, str, float]:
-        unknowns = Unknowns(GaussianCoordinates(1, LENGTH, robot.rod.force_scale), registration=frame, uncertainty=stated)
-        fit = estimate(Problem(robot, unknowns, [Markers(s, p, noise * LENGTH)], tension))
+
+def _problem(row: Row, markers: Markers, tension: Reading, stated: bool) -> Problem:
+    loads = GaussianCoordinates(1, LENGTH, row.robot.rod.force_scale)
+    own = (row.frame, row.stated) if stated else (None, None)
+    return Problem(row.robot, Unknowns(loads, registration=own[0], uncertainty=own[1]), [markers], tension)
+
+
+def counted(row: Row, noise: float, cases: int) -> str:
+    """The row of the second table: whether there is a contact, where nothing pushes and where something does."""
+    cells = []
+    for pushed in (False, True):
+        markers, tension, _, place = shapes_of(row, noise, cases, pushed)
+        for stated in (False, True):
+            problem = _problem(row, markers, tension, stated)
+            found = analyze(problem, contact_hypotheses(problem)).estimate
+            there = torch.isfinite(found.location)
+            sure = (there & (found.magnitude_interval[..., 0] > 0)).any(-1) & found.accepted
+            cells.append(f"{100 * float(sure.double().mean()):.0f}")
+            if pushed:
+                one = there.sum(-1) == 1
+                held = (found.location_interval[:, :1, 0] <= place) & (place <= found.location_interval[:, :1, 1])
+                cells.append(f"{100 * float(one.double().mean()):.0f}")
+                cells.append(f"{100 * float(held[one].double().mean()):.0f}" if bool(one.any()) else "-")
+    bare, told = cells[:2]
+    exact, stated = (" / ".join(part) for part in (cells[2:5], cells[5:]))
+    return f"| {row.name} | {100 * noise:g} | {bare} | {told} | {exact} | {stated} |"
+
+
+def measured(row: Row, noise: float, cases: int) -> str:
+    """The row of the first table."""
+    markers, tension, size, place = shapes_of(row, noise, cases, True)
+
+    def fitted(stated: bool) -> tuple[str, str, float]:
+        fit = estimate(_problem(row, markers, tension, stated))
         return f"{100 * float(fit.accepted.double().mean()):.0f} %", *_held(fit, size, place)
 
-    exact, stated = fitted(None, None), fitted(row.stated, row.frame)
+    exact, stated = fitted(False), fitted(True)
     errors = f"{1e3 * exact[2]:.1f} / {1e3 * stated[2]:.1f}"
     return f"| {row.name} | {100 * noise:g} | {exact[0]} | {exact[1]} | {stated[0]} | {stated[1]} | {errors} |"
 
@@ -172,6 +215,27 @@ def _held(fit: Estimate, size: Tensor, place: Tensor) -> tuple[str, float]:
     return " / ".join(shares), float((fit.location - place)[done].abs().mean())
 
 
+def contact_rows() -> list[Row]:
+    """What each is off by where it is asked whether anything pushes."""
+    every = {row.name: row.robot for row in rows()}
+    passive, three = every["passive: mass 20 %"], every["three tendons: tension 5 %"]
+    one = replace(three, tendons=Tendons(three.tendons.tendons[:1]))
+    found = []
+    for name, robot in (("passive", passive), ("one tendon", one), ("three tendons", three)):
+        found += [
+            Row(f"{name}: stiffness 3 %", robot, _stiffness(0.03), Uncertainty(stiffness=0.03)),
+            Row(f"{name}: mass 5 %", robot, _mass(0.05), Uncertainty(mass=0.05)),
+            Row(f"{name}: set 0.1/m", robot, _set(0.1), Uncertainty(set=0.1)),
+            Row(f"{name}: frame 0.5 mm, 0.3 degrees", robot, _nothing, None, Registration(5e-4, math.radians(0.3))),
+        ]
+        if len(robot.tendons):
+            found += [
+                Row(f"{name}: tension 3 %", robot, _gain(0.03), Uncertainty(tension=0.03)),
+                Row(f"{name}: friction 0.1", robot, _friction(0.1), Uncertainty(friction=0.1)),
+            ]
+    return found
+
+
 def main() -> None:
     """All rows, told and written as they come."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -183,10 +247,18 @@ def main() -> None:
     path.write_text(HEAD.format(cases=options.cases, error=100 * math.sqrt(0.95 * 0.05 / options.cases)))
     for row in rows():
         for noise in (0.001, 0.0025):
-            line = measured(row, noise, options.cases)
-            print(line, flush=True)
-            with path.open("a") as file:
-                file.write(line + "\n")
+            _tell(path, measured(row, noise, options.cases))
+    few = max(1, options.cases // 4)
+    _tell(path, CONTACTS.format(cases=few))
+    for row in contact_rows():
+        for noise in (0.001, 0.0025):
+            _tell(path, counted(row, noise, few))
+
+
+def _tell(path: Path, line: str) -> None:
+    print(line, flush=True)
+    with path.open("a") as file:
+        file.write(line + "\n")
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ def _values(family: LoadFamily, gamma: Float[Tensor, "b D g"], s: Float[Tensor, 
     for load in family.loads(gamma):
         if isinstance(load, GaussianLoads):  # the same as its density, with the draws innermost: a fifth of the time
             for k in range(load.mu.shape[-1]):
-                a_x, a_y, c = (v[..., k].to(single).unsqueeze(1) for v in (*load.a.unbind(-1), load.c))
+                a_x, a_y, c = (v[..., k].to(single).unsqueeze(1) for v in (load.a[..., 0], load.a[..., 1], load.c))
                 off = (s.unsqueeze(-1) - load.mu[..., k].unsqueeze(1)).to(single)
                 bell = off.square_().mul_(-c).clamp_(min=FADED).exp_().sub_(math.exp(FADED))
                 found[:, 0].addcmul_(a_x, bell)
