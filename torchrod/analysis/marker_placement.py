@@ -77,7 +77,7 @@ def _information(
     registration: Registration | None,
     directions: int,
     steps: int,
-    uncertainty: Uncertainty | None,
+    uncertainty: Uncertainty | None = None,
 ) -> tuple[Float[Tensor, "C B m m"], Float[Tensor, "m m"]]:
     """A_i of (1) for every candidate and push, and `held`. Pushes without an equilibrium are left out."""
     at = places(robot, PLACES, nearest).repeat_interleave(directions)

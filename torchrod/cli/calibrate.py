@@ -31,13 +31,18 @@ from ..util.status import Status
 from .arguments import as_calibrated, noise_std, positive, writable
 
 
+USED = {"position_std", "hung", "hung_at"}
+
+
 def calibrate(options: Namespace) -> None:
     """torchrod calibrate."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*nothing hangs")  # the mass is what is sought
         robot = read_robot(options.robot)
     nearly = read_uncertainty(options.robot)
-    shapes = as_calibrated(options.shapes, read_shapes(options.shapes, robot, options.units), nearly.calibrated)
+    shapes = as_calibrated(options.shapes, read_shapes(options.shapes, robot, options.units, options.tensions), nearly.calibrated)
+    if unused := sorted(set(shapes.readings) - USED):
+        warnings.warn(f"{options.shapes}: {', '.join(unused)} play no part: calibrate reads positions", stacklevel=2)
     noise_std(options.noise)
     positive("--max-iterations", options.max_iterations)
     writable(options.out, (".toml",))

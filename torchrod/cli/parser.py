@@ -123,6 +123,7 @@ def _calibrate_parser() -> ArgumentParser:
     parser.add_argument("robot", type=str, help="ROBOT.toml with gravity; its mass_per_length is the start, if positive")
     parser.add_argument("shapes", type=str, help="SHAPES.csv or .npz without external load, all of this robot")
     _units(parser)
+    _tensions(parser)
     parser.add_argument("--noise", type=float, default=1e-3, help="standard deviation of a marker coordinate (m)")
     parser.add_argument("--youngs-modulus", action="store_true", help="also the stiffness, E and G together; needs tensions")
     parser.add_argument("--tension-offset", action="store_true", help="also one offset (N) per tendon, added to its readings")
