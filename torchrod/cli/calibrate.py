@@ -30,7 +30,6 @@ from ..util.errors import InputError
 from ..util.status import Status
 from .arguments import as_calibrated, noise_std, positive, writable
 
-
 USED = {"position_std", "hung", "hung_at"}
 
 
