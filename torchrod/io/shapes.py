@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..model.sensors import BaseWrench, Curvature, Markers, Poses, Sensor
+from ..model.sensors import BaseWrench, CentreLine, Curvature, Markers, Poses, Sensor
 from ..util.precision import DTYPE, Float64
 
 
@@ -25,7 +25,8 @@ class Shapes(Float64):
     in the section frame. tension: (B, T) N, readings of the load cells. time: (B,) s. readings: everything else by the name of its
     kind, (B, P, k) of places along the rod or (B, k) of the whole robot, NaN where missing: `position_std` (B, P, 1) m, the
     standard deviation of a coordinate of that position; `orientations` (B, P, 4), unit quaternions (x, y, z, w), base frame;
-    `curvature` (B, P, 2) 1/m, section frame; `base_wrench` (B, 6) N and N m, base frame.
+    `curvature` (B, P, 2) 1/m, section frame; `base_wrench` (B, 6) N and N m, base frame. `centre_line` (B, M, 3) m, base frame, is
+    of no places: points on the rod of unknown arc lengths, in any order; s are then the places between which they are looked for.
     """
 
     s: Float[Tensor, " P"]
@@ -57,6 +58,12 @@ class Shapes(Float64):
             warnings.simplefilter("ignore")
             return sum(int(sensor.groups.max()) + 1 for sensor in self.sensors(Noises(1.0, 1.0, (1.0, 1.0), 1.0)))
 
+    @property
+    def points(self) -> Float[Tensor, "B N 3"]:
+        """All positions that were measured (m), NaN where missing."""
+        line = self.readings.get("centre_line")
+        return self.positions if line is None else line
+
     def sensors(self, noise: "Noises") -> list[Sensor]:
         """Everything that was measured, by the sensors that take it. Errors: ValueError where a noise is needed and not stated."""
         made = [kind.sensor(self, noise) for kind in KINDS if kind.sensor is not None]
@@ -76,11 +83,14 @@ class Noises:
 
 
 class Of(Enum):
-    """What a reading is of: a marker of a sample, a marker in all samples, or a whole sample."""
+    """What a reading is of: a marker of a sample, a marker in all samples, a whole sample, or a point of a sample, which is at no
+    known place.
+    """
 
     MARKER = "marker"
     PLACE = "place"
     SAMPLE = "sample"
+    POINT = "point"
 
 
 @dataclass(frozen=True)
@@ -141,6 +151,11 @@ def _curvature(shapes: Shapes, noise: Noises) -> Curvature | None:
     return Curvature(shapes.s[places], readings[:, places], noise.curvature) if bool(places.any()) else None
 
 
+def _centre_line(shapes: Shapes, noise: Noises) -> CentreLine | None:
+    points = shapes.readings.get("centre_line")
+    return None if points is None else CentreLine(shapes.s, points, noise.position)
+
+
 def _base(shapes: Shapes, noise: Noises) -> BaseWrench | None:
     readings = shapes.readings.get("base_wrench")
     if readings is None:
@@ -156,5 +171,6 @@ KINDS = (
     Kind("position_std", ("sx",), Of.MARKER, True),
     Kind("orientations", ("qx", "qy", "qz", "qw"), Of.MARKER, False, _poses),
     Kind("curvature", ("kx", "ky"), Of.MARKER, False, _curvature),
+    Kind("centre_line", (), Of.POINT, True, _centre_line),  # columns x, y, z of a file without s
     Kind("base_wrench", ("base_fx", "base_fy", "base_fz", "base_mx", "base_my", "base_mz"), Of.SAMPLE, False, _base),
 )
