@@ -15,12 +15,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.robots import T, steel_rod
-from torchrod import PointForces, Shapes, read_shapes, solve_shape
+from torchrod import CentreLine, PointForces, Shapes, read_shapes, solve_shape
 from torchrod.cli import main
 from torchrod.cli.lab_import import _warn_of_distance
 from torchrod.cli.parser import IMPORTED
+from torchrod.io import Noises
 from torchrod.io.lab_formats import FORMATS, Imported, labels
 from torchrod.io.lab_formats.labels import labelled, rod_of
+from torchrod.util.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 ROD = (ROOT / "docs" / "example" / "rod.toml").read_text()
@@ -378,6 +380,27 @@ def test_left_handed_exports_are_told(tmp_path, capsys, form):
     assert "left-handed (mirrored)" in capsys.readouterr().err
     shapes = imported(tmp_path, "wide", wide(t, points), "left_handed = true\n" + plan)
     assert np.allclose(shapes.positions.numpy(), t.own, atol=1e-8)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_a_centre_line(tmp_path, suffix):
+    """Points in any order, of frames with different numbers of them, in another world: what is written is read, in any unit."""
+    t, g = take(3), np.random.default_rng(0)
+    order = [g.permutation(len(S))[: len(S) - k] for k in range(3)]
+    rows = [f"{k};{';'.join(f'{1e3 * v:.9f}' for v in t.markers[k, i])}" for k in range(3) for i in order[k]]
+    plan = f"units = 'mm'\nrate = 10\n[base]\nposition = {ORIGIN.tolist()}\nrotation = {POSE.as_quat().tolist()}\n[centre_line]\n"
+    shapes = imported(tmp_path, "line", "Frame;X;Y;Z\n" + "\n".join(rows), plan, f"s.{suffix}")
+    assert shapes.time is not None and shapes.time.tolist() == [0.0, 0.1, 0.2]
+    assert not torch.isfinite(shapes.positions).any() and float(shapes.s[-1]) == 0.4
+    for k in range(3):
+        p = shapes.points[k].numpy()
+        assert np.allclose(p[np.isfinite(p).all(-1)], t.own[k, order[k]], atol=1e-9)
+    (sensor,) = shapes.sensors(Noises(1e-3, 0.01))
+    assert isinstance(sensor, CentreLine) and int(sensor.present.sum()) == 3 * len(S) - 3
+    (tmp_path / "far.csv").write_text("x,y,z\n" + "\n".join(f"{1e3 * v[0]},{1e3 * v[1]},{1e3 * v[2]}" for v in t.own[0]))
+    with pytest.raises(InputError, match=r"centre line are up to .* give metres or --units"):
+        read_shapes(tmp_path / "far.csv", steel_rod())
+    assert read_shapes(tmp_path / "far.csv", steel_rod(), "mm").points.shape == (1, len(S), 3)
 
 
 def test_from_the_export_to_the_load(tmp_path):

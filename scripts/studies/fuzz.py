@@ -102,7 +102,7 @@ names = ["A", "B", "C"]
 s_mm = [100, 250, 400]
 offset = [0, 0.001, 0]
 """
-FORMS = ("motive", "headerless", "vicon", "qualisys", "trc", "aurora", "toolbox", "fbgs", "luna", "wide", "c3d")
+FORMS = ("motive", "headerless", "vicon", "qualisys", "trc", "aurora", "toolbox", "fbgs", "luna", "wide", "line", "c3d")
 FRAMES = 3
 
 
@@ -151,8 +151,10 @@ def _texts() -> dict[str, tuple[str, str]]:
     head = "clock;" + ";".join(f"{n}_{a}" for n in NAMES for a in "xyz")
     found["wide"] = (
         head + "\n" + "\n".join(f"{0.01 * k};" + m[k].replace(",", ";") for k in range(FRAMES)),
-        "time = 'clock'\n" + ("units = 'm'\n" + MARKERS),
+        f"time = 'clock'\nunits = 'm'\n{MARKERS}",
     )
+    rows = [f"{k},{x},{y},{z}" for k in range(FRAMES) for x, y, z in _threes(mm[k])]
+    found["line"] = "Frame,X,Y,Z\n" + "\n".join(rows), "units = 'mm'\nrate = 10\n[base]\nposition = [0.1, 0, 0]\n[centre_line]\n"
     return found
 
 

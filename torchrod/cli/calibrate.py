@@ -40,6 +40,8 @@ def calibrate(options: Namespace) -> None:
         robot = read_robot(options.robot)
     nearly = read_uncertainty(options.robot)
     shapes = as_calibrated(options.shapes, read_shapes(options.shapes, robot, options.units, options.tensions), nearly.calibrated)
+    if "centre_line" in shapes.readings:
+        raise InputError(f"{options.shapes}: calibrate reads markers, at known s; a centre line alone does not serve")
     if unused := sorted(set(shapes.readings) - USED):
         warnings.warn(f"{options.shapes}: {', '.join(unused)} play no part: calibrate reads positions", stacklevel=2)
     noise_std(options.noise)

@@ -82,7 +82,7 @@ def _registration(options: Namespace) -> Registration | None:
 
 def _warn_of_idle(options: Namespace, robot: Robot, shapes: Shapes) -> None:
     """Say of every option that has nothing to act on."""
-    seen = torch.isfinite(shapes.positions).all(-1)
+    seen = torch.isfinite(shapes.points).all(-1)
     stated = shapes.readings.get("position_std")
     unstated = seen if stated is None else seen & ~torch.isfinite(stated[..., 0])
     lacks = {name: f"{options.shapes} has no {columns}" for name, columns in NOISE_OF.items() if name not in shapes.readings}
@@ -230,4 +230,4 @@ def _draw(path: str, robot: Robot, shapes: Shapes, found: Analysis) -> None:
     b = drawable[0]
     title = f"{robot.name}, sample {shapes.samples[b]}: {fit.message(b)}"
     tension = None if shapes.tension is None else shapes.tension[b]
-    draw(path, robot, fit.fitted_rod(b, found.profile), shapes.positions[b], tension, title)
+    draw(path, robot, fit.fitted_rod(b, found.profile), shapes.points[b], tension, title)

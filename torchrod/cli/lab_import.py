@@ -42,6 +42,8 @@ def lab_import(options: Namespace) -> None:
 def _warn_of_distance(file: str, found: Imported) -> None:
     """No place of a rod is farther from its base than the rod is long up to there: such positions are not in the base frame."""
     shapes = found.shapes
+    if not len(shapes.s):  # of a centre line: read_shapes looks at it
+        return
     reach = shapes.s if shapes.offsets is None else shapes.s + shapes.offsets.norm(dim=-1)
     far = shapes.positions.norm(dim=-1) > FAR * reach + FAR_FROM_BASE * float(shapes.s.max())
     if 2 * int(far.sum()) > int(torch.isfinite(shapes.positions).all(-1).sum()):
@@ -52,11 +54,12 @@ def _warn_of_distance(file: str, found: Imported) -> None:
 
 def _report(out: str, found: Imported) -> str:
     shapes = found.shapes
-    read = torch.isfinite(shapes.positions).all(-1)
+    read = torch.isfinite(shapes.points).all(-1)
     for values in shapes.readings.values():
         read = read | torch.isfinite(values).all(-1)
     gone = f", {int((~read).sum())} of {read.numel()} readings missing" if bool((~read).any()) else ""
-    lines = [f"{out}: {len(shapes.samples)} samples of {len(shapes.s)} places along the rod{gone}"]
+    places = f"{len(shapes.s)} places along the rod" if len(shapes.s) else f"up to {read.shape[1]} points on the rod"
+    lines = [f"{out}: {len(shapes.samples)} samples of {places}{gone}"]
     if found.rms is not None:
         lines.append(f"markers of the base plate: {1e3 * found.rms:.3g} mm from their places")
     if found.pose is not None:

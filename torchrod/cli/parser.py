@@ -16,7 +16,7 @@ from ..util.units import LENGTHS
 from .arguments import MOST_STEPS, apart
 from .screen import held_back, one_line, tell
 
-IMPORTED = ("motive", "vicon", "qualisys", "trc", "c3d", "aurora", "toolbox", "fbgs", "luna", "wide")
+IMPORTED = ("motive", "vicon", "qualisys", "trc", "c3d", "aurora", "toolbox", "fbgs", "luna", "wide", "line")
 Steps = restricted_number_type("from 1 to 100,000", int, [(">=", 1), ("<=", MOST_STEPS)])
 
 
@@ -203,7 +203,7 @@ def _dataset_parser() -> ArgumentParser:
 
 def _import_parser() -> ArgumentParser:
     parser = _Parser(description="Shapes from a file of a measuring system, in the robot's base frame.")
-    parser.add_argument("format", type=str, choices=IMPORTED, help="what wrote the file; wide: a table with a line for each frame")
+    parser.add_argument("format", type=str, choices=IMPORTED, help="what wrote it; wide, line: tables of frames, of points")
     parser.add_argument("file", type=str, help="the file, as it was exported")
     parser.add_argument("--robot", type=str, required=True, help="ROBOT.toml")
     parser.add_argument("--layout", type=str, required=True, help="LAYOUT.toml: which name is what on the robot")

@@ -21,4 +21,4 @@ def plot(options: Namespace) -> None:
     fit = read_fit(options.result, sample, robot.name, shapes.groups, robot.rod.length)
     b = shapes.samples.index(sample)
     tension = None if shapes.tension is None else shapes.tension[b]
-    draw(options.out, robot, fit, shapes.positions[b], tension, f"{robot.name}, sample {sample}")
+    draw(options.out, robot, fit, shapes.points[b], tension, f"{robot.name}, sample {sample}")

@@ -28,6 +28,9 @@ from .tension_file import TENSION, read_tensions
 COLUMNS = ("sample", "time", "s", *(name for kind in KINDS for name in kind.columns))
 TENSION_EXAMPLES = ("tension_1", "tension_2")
 POSITIONS, OFFSETS = KINDS[0], KINDS[1]
+LINE = next(kind for kind in KINDS if kind.of is Of.POINT)
+PLACES = 81  # between which a centre line's points are looked for
+FAR = 5.0  # times the rod's length: no base frame is so far off
 UNITS = re.compile(r"""\s*units\s*[=:]\s*["']?([^"']*?)["']?\s*""", re.IGNORECASE)
 SLACK = 0.05  # of the largest tension in the file: a load cell's zero may drift by so much
 UNIT_QUATERNION = 1e-2
@@ -49,15 +52,10 @@ def read_shapes(path: str | Path, robot: Robot, units: str | None = None, tensio
             raise InputError(f"{path}: is empty; expected a CSV with header s,x,y,z or an NPZ with s and positions")
         with path.open("rb") as file:
             shapes = _read_npz(path, file, units) if path.suffix == ".npz" else _read_csv(path, file, units)
-    _check_rotations(path, shapes)
-    gap, L = at_origin(shapes.markers(1.0)), robot.rod.length
-    markers = replace(shapes, positions=torch.where(gap.unsqueeze(-1), torch.nan, shapes.positions))
-    outside = ~on_rod(markers.s, L)
-    if bool(outside.any()):
-        hint = "is it in millimetres? give metres, or --units mm" if float(markers.s.max()) > 30 * L else "s is in metres"
-        raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
-    if said := too_short(markers.s, L) or too_far(markers.markers(1.0), L):
-        raise InputError(f"{path}: {said}")
+    if LINE.name in shapes.readings:
+        markers, gap = _line_on(path, shapes, robot.rod.length), torch.zeros(0, dtype=torch.bool)
+    else:
+        markers, gap = _markers_on(path, shapes, robot.rod.length)
     T, cells = len(robot.tendons), path
     if tensions is not None:
         cells, markers = Path(tensions), with_tensions(path, markers, robot, tensions)
@@ -69,7 +67,39 @@ def read_shapes(path: str | Path, robot: Robot, units: str | None = None, tensio
     _check_pulls(cells, markers, robot)
     if bool(gap.any()):
         _warn_of_gaps(path, gap, markers.s)
-    return replace(markers, s=markers.s.clamp(0, L))
+    return replace(markers, s=markers.s.clamp(0, robot.rod.length))
+
+
+def _markers_on(path: Path, shapes: Shapes, L: float) -> tuple[Shapes, Bool[Tensor, "B P"]]:
+    """What was measured at known places of a rod of length L (m), without positions at exactly zero; where these were."""
+    _check_rotations(path, shapes)
+    gap = at_origin(shapes.markers(1.0))
+    markers = replace(shapes, positions=torch.where(gap.unsqueeze(-1), torch.nan, shapes.positions))
+    outside = ~on_rod(markers.s, L)
+    if bool(outside.any()):
+        hint = "is it in millimetres? give metres, or --units mm" if float(markers.s.max()) > 30 * L else "s is in metres"
+        raise InputError(f"{path}: s = {float(markers.s[outside][0]):g} m lies outside the rod of 0 to {L:g} m; {hint}")
+    if said := too_short(markers.s, L) or too_far(markers.markers(1.0), L):
+        raise InputError(f"{path}: {said}")
+    return markers, gap
+
+
+def _line_on(path: Path, shapes: Shapes, L: float) -> Shapes:
+    """Points of a centre line, with the places of a rod of length L (m) between which they are looked for."""
+    p = shapes.readings[LINE.name]
+    reach = p.norm(dim=-1).nan_to_num(0.0).amax(-1)
+    if float(reach.max()) > FAR * L:
+        raise InputError(
+            f"{path}: points of the centre line are up to {float(reach.max()):.3g} m from the base of a rod of {L:g} m; give "
+            "metres or --units, in the robot's base frame"
+        )
+    if float(reach.max()) < L / FAR:
+        raise InputError(
+            f"{path}: no point of the centre line is farther than {float(reach.max()):.3g} m from the base of a rod of {L:g} m; "
+            "give metres or --units"
+        )
+    s = torch.linspace(0, L, PLACES, dtype=p.dtype)
+    return replace(shapes, s=s, positions=p.new_full((len(p), PLACES, 3), torch.nan))
 
 
 def with_tensions(path: Path, shapes: Shapes, robot: Robot, tensions: str | Path) -> Shapes:
@@ -159,7 +189,7 @@ def _expected(P: int | None, B: int | None) -> dict[str, tuple[int | str | None,
     shapes: dict[str, tuple[int | str | None, ...]] = {"s": (P or "P",), "time": (B or "B",), "sample": (B or "B",), "units": ()}
     shapes["tensions"] = (B or "B", "T")
     for kind in KINDS:
-        of = {Of.MARKER: (B or "B", P or "P"), Of.PLACE: (P or "P",), Of.SAMPLE: (B or "B",)}[kind.of]
+        of = {Of.MARKER: (B or "B", P or "P"), Of.PLACE: (P or "P",), Of.SAMPLE: (B or "B",), Of.POINT: (B or "B", "M", 3)}[kind.of]
         shapes[kind.name] = (*of, *((len(kind.columns),) if len(kind.columns) > 1 else ()))
     return shapes
 
@@ -177,6 +207,12 @@ def _read_npz(path: Path, file: IO[bytes], units: str | None) -> Shapes:
         if not (np.issubdtype(value.dtype, np.floating) or np.issubdtype(value.dtype, np.integer)):
             raise InputError(f"{path}: array '{key}' does not hold numbers; save it as float64")
     given = [kind for kind in KINDS if kind.name in data and kind.of is not Of.PLACE]
+    if alone := LINE.name in data:
+        if other := [name for name in ("s", *(kind.name for kind in KINDS if kind is not LINE)) if name in data]:
+            raise InputError(
+                f"{path}: array '{other[0]}' stands beside {LINE.name}, whose points are at no known s; keep one of them"
+            )
+        data["s"] = np.zeros(1)
     if "s" not in data or not given:
         key = "s" if "s" not in data else "positions"
         raise InputError(f"{path}: array '{key}' is missing; expected s (P,) and positions (B, P, 3)")
@@ -187,7 +223,9 @@ def _read_npz(path: Path, file: IO[bytes], units: str | None) -> Shapes:
         raise InputError(f"{path}: holds no marker; give at least one in s (P,) and one sample of it in positions (B, P, 3)")
     named, wanted = _expected(None, None), _expected(P, B)
     for key, value in (data | texts).items():
-        if len(value.shape) != len(wanted[key]) or any(w not in ("T", n) for w, n in zip(wanted[key], value.shape, strict=True)):
+        if len(value.shape) != len(wanted[key]) or any(
+            w not in ("T", "M", n) for w, n in zip(wanted[key], value.shape, strict=True)
+        ):
             form = f"({', '.join(map(str, named[key]))}{',' * (len(named[key]) == 1)})"
             raise InputError(f"{path}: array '{key}' has shape {value.shape}; expected {form} with P = {P} and B = {B}")
     for key, value in data.items():
@@ -195,12 +233,13 @@ def _read_npz(path: Path, file: IO[bytes], units: str | None) -> Shapes:
             raise InputError(
                 f"{path}: array '{key}' holds a value that is not finite; only positions may be NaN (a missing marker)"
             )
-    _increasing(path, data["s"], data.get("offsets"), "all")
+    if not alone:
+        _increasing(path, data["s"], data.get("offsets"), "all")
     scale = _scale(path, units, str(texts["units"]) if "units" in texts else None)
     names = [str(name) for name in texts["sample"]] if "sample" in texts else [str(i) for i in range(B)]
     lengths = {"s"} | {kind.name for kind in KINDS if kind.length}
     found = {key: torch.from_numpy(value * scale if key in lengths and scale != 1.0 else value) for key, value in data.items()}
-    readings = {k.name: found[k.name] if len(k.columns) > 1 else found[k.name].unsqueeze(-1) for k in _further(found)}
+    readings = {k.name: found[k.name].unsqueeze(-1) if len(k.columns) == 1 else found[k.name] for k in _further(found)}
     positions = found.get("positions", torch.full((B, P, 3), torch.nan, dtype=torch.float64))
     return Shapes(found["s"], positions, names, found.get("offsets"), found.get("tensions"), found.get("time"), readings)
 
@@ -219,7 +258,7 @@ def _names(cells: list[str]) -> list[str]:
 
 def _is_header(cells: list[str]) -> bool:
     names = set(_names(cells))
-    return "s" in names and len(names & {*COLUMNS}) >= LEAST_COLUMNS
+    return ("s" in names or names >= {*POSITIONS.columns}) and len(names & {*COLUMNS}) >= LEAST_COLUMNS
 
 
 def _stated_units(remarks: list[str]) -> str | None:
@@ -234,6 +273,8 @@ def _read_csv(path: Path, file: IO[bytes], units: str | None) -> Shapes:
         raise InputError(f"{path}: has a header but no rows; give one row per marker")
     scale = _scale(path, units, _stated_units(table.remarks))
     samples, which = _samples_of(table, names)
+    if "s" not in names:
+        return _centre_line(path, table, names, kinds, tensions, (samples, which), scale)
     s = _finite(table, names, "s") * scale
     columns = {kind.name: np.stack([_column(table, names, kind, key) for key in kind.columns], -1) for kind in kinds}
     columns = {kind.name: columns[kind.name] * (scale if kind.length else 1.0) for kind in kinds}
@@ -274,10 +315,44 @@ def _read_csv(path: Path, file: IO[bytes], units: str | None) -> Shapes:
     )
 
 
+def _centre_line(
+    path: Path,
+    table: Table,
+    names: list[str],
+    kinds: list[Kind],
+    tensions: list[str],
+    of: tuple[list[str], Int[np.ndarray, " rows"]],
+    scale: float,
+) -> Shapes:
+    """Points without arc lengths, a row each."""
+    if other := [kind.columns[0] for kind in kinds if kind is not POSITIONS]:
+        raise InputError(f"{path}: column '{other[0]}' needs a column s; without s the rows are points of a centre line, x,y,z")
+    samples, which = of
+    p = scale * np.stack([_column(table, names, POSITIONS, key) for key in POSITIONS.columns], -1)
+    order = np.argsort(which, kind="stable")
+    parts = np.split(p[order], np.flatnonzero(np.diff(which[order])) + 1)
+    whole = np.full((len(samples), max(len(part) for part in parts), 3), math.nan)
+    if whole.size > MOST_READINGS:
+        raise InputError(f"{path}: its samples have up to {whole.shape[1]} points, too many for one table; give fewer in a file")
+    for b, part in enumerate(parts):
+        whole[b, : len(part)] = part
+    time = _once(table, samples, which, _finite(table, names, "time"), "time") if "time" in names else None
+    pulls = [_once(table, samples, which, _finite(table, names, key), key) for key in tensions]
+    return Shapes(
+        torch.zeros(0),
+        torch.zeros(len(samples), 0, 3),
+        samples,
+        None,
+        torch.from_numpy(np.stack(pulls, -1)) if pulls else None,
+        None if time is None else torch.from_numpy(time),
+        {LINE.name: torch.from_numpy(whole)},
+    )
+
+
 def _check_header(path: Path, names: list[str]) -> tuple[list[Kind], list[str]]:
     """The kinds of measurement that there are, and the tensions' columns in their order."""
-    if "s" not in names:
-        raise InputError(f"{path}: column 's' is missing; the header starts with s,x,y,z")
+    if "s" not in names and not {*POSITIONS.columns} <= {*names}:
+        raise InputError(f"{path}: column 's' is missing; the header starts with s,x,y,z, or with x,y,z of a centre line")
     known = [*COLUMNS, *(name for name in names if TENSION.fullmatch(name))]
     for name in names:
         if name in known and names.count(name) > 1:
@@ -359,17 +434,19 @@ def write_shapes(path: str | Path, shapes: Shapes) -> None:
         raise InputError(f"{path}: {len(shapes.samples)} names for {len(shapes.positions)} samples; give every sample its name")
     if path.suffix == ".npz":
         content: dict[str, Tensor | None] = {"s": shapes.s, "positions": shapes.positions, "offsets": shapes.offsets}
+        content = {} if LINE.name in shapes.readings else content
         content |= {"tensions": shapes.tension, "time": shapes.time}
         content |= {name: v.squeeze(-1) if v.shape[-1] == 1 else v for name, v in shapes.readings.items()}
         arrays = {name: value.numpy() for name, value in content.items() if value is not None}
         put(path, lambda file: np.savez(file, sample=np.array(shapes.samples), **arrays))  # pyright: ignore[reportArgumentType]
         return
-    kinds = [kind for kind in KINDS if kind is POSITIONS or kind.name in shapes.readings]
+    kinds = [kind for kind in KINDS if kind is POSITIONS or (kind.columns and kind.name in shapes.readings)]
     kinds += [OFFSETS] if shapes.offsets is not None else []
     tensions = [] if shapes.tension is None else [f"tension_{i + 1}" for i in range(shapes.tension.shape[-1])]
     time = [] if shapes.time is None else ["time"]
-    header = ["sample", *time, "s", *(name for kind in kinds for name in kind.columns), *tensions]
-    places = shapes.s.tolist()
+    line = shapes.readings.get(LINE.name)
+    header = ["sample", *time, *(["s"] if line is None else []), *(name for kind in kinds for name in kind.columns), *tensions]
+    places = [[s] for s in shapes.s.tolist()]
 
     def write(file: IO[bytes]) -> None:
         for b in range(-1, len(shapes.samples)):
@@ -381,10 +458,10 @@ def write_shapes(path: str | Path, shapes: Shapes) -> None:
                 name = _quoted(shapes.samples[b])
                 at = [] if shapes.time is None else [shapes.time[b].item()]
                 tension = [] if shapes.tension is None else shapes.tension[b].tolist()
-                cells = torch.cat([_of_sample(shapes, kind, b) for kind in kinds], -1)
-                for s, row in zip(places, cells.tolist(), strict=True):
+                cells = torch.cat([_of_sample(shapes, kind, b) for kind in kinds], -1) if line is None else line[b]
+                for s, row in zip(places if line is None else [[]] * len(cells), cells.tolist(), strict=True):
                     text.write(name + ",")
-                    writer.writerow([*at, s, *("" if math.isnan(v) else v for v in row), *tension])
+                    writer.writerow([*at, *s, *("" if math.isnan(v) else v for v in row), *tension])
             file.write(text.getvalue().encode())
 
     put(path, write)

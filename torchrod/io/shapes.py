@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..mechanics.lie import conjugate, exponential, product, unrotate
-from ..model.sensors import BaseWrench, Curvature, Markers, Poses, Sensor
+from ..model.sensors import BaseWrench, CentreLine, Curvature, Markers, Poses, Sensor
 from ..util.precision import DTYPE, Float64
 
 SAME_PLACE = 1e-6  # m: markers of two files that are one
@@ -29,7 +29,8 @@ class Shapes(Float64):
     kind, (B, P, k) of places along the rod or (B, k) of the whole robot, NaN where missing: `position_std` (B, P, 1) m, the
     standard deviation of a coordinate of that position; `orientations` (B, P, 4), unit quaternions (x, y, z, w), base frame;
     `curvature` (B, P, 2) 1/m, section frame; `hung_at` (B, 1) m and `hung` (B, 1) kg, a weight that is known to hang there, for
-    torchrod calibrate; `base_wrench` (B, 6) N and N m, base frame.
+    torchrod calibrate; `base_wrench` (B, 6) N and N m, base frame. `centre_line` (B, M, 3) m, base frame, is of no places: points
+    on the rod of unknown arc lengths, in any order; s are then the places between which they are looked for.
     """
 
     s: Float[Tensor, " P"]
@@ -58,9 +59,9 @@ class Shapes(Float64):
         """As they would be measured without errors that are known: of the base frame, [m, rad], and of markers, rows
         [s, x, y, z, std] (m). Errors: ValueError for a marker of which nothing is known, where something is of others.
         """
-        R = exponential(zeta[3:])
+        R, readings = exponential(zeta[3:]), dict(self.readings)
         p = unrotate(R, self.positions - zeta[:3])
-        if len(markers):
+        if len(markers) and "centre_line" not in readings:
             off = (self.s.unsqueeze(-1) - markers[:, 0]).abs()
             if bool((off.amin(-1) > SAME_PLACE).any()):
                 s = float(self.s[off.amin(-1) > SAME_PLACE][0])
@@ -68,7 +69,8 @@ class Shapes(Float64):
                     f"the marker at s = {s:g} m was not calibrated; calibrate with it, or leave out markers in [calibration]"
                 )
             p = p - markers[off.argmin(-1), 1:4]
-        readings = dict(self.readings)
+        if "centre_line" in readings:
+            readings["centre_line"] = unrotate(R, readings["centre_line"] - zeta[:3])
         if "orientations" in readings:
             readings["orientations"] = product(conjugate(R), readings["orientations"])
         return replace(self, positions=p, readings=readings)
@@ -79,6 +81,12 @@ class Shapes(Float64):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return sum(int(sensor.groups.max()) + 1 for sensor in self.sensors(Noises(1.0, 1.0, (1.0, 1.0), 1.0)))
+
+    @property
+    def points(self) -> Float[Tensor, "B N 3"]:
+        """All positions that were measured (m), NaN where missing."""
+        line = self.readings.get("centre_line")
+        return self.positions if line is None else line
 
     def sensors(self, noise: "Noises") -> list[Sensor]:
         """Everything that was measured, by the sensors that take it. Errors: ValueError where a noise is needed and not stated."""
@@ -99,11 +107,14 @@ class Noises:
 
 
 class Of(Enum):
-    """What a reading is of: a marker of a sample, a marker in all samples, or a whole sample."""
+    """What a reading is of: a marker of a sample, a marker in all samples, a whole sample, or a point of a sample, which is at no
+    known place.
+    """
 
     MARKER = "marker"
     PLACE = "place"
     SAMPLE = "sample"
+    POINT = "point"
 
 
 @dataclass(frozen=True)
@@ -164,6 +175,11 @@ def _curvature(shapes: Shapes, noise: Noises) -> Curvature | None:
     return Curvature(shapes.s[places], readings[:, places], noise.curvature) if bool(places.any()) else None
 
 
+def _centre_line(shapes: Shapes, noise: Noises) -> CentreLine | None:
+    points = shapes.readings.get("centre_line")
+    return None if points is None else CentreLine(shapes.s, points, noise.position)
+
+
 def _base(shapes: Shapes, noise: Noises) -> BaseWrench | None:
     readings = shapes.readings.get("base_wrench")
     if readings is None:
@@ -181,5 +197,6 @@ KINDS = (
     Kind("curvature", ("kx", "ky"), Of.MARKER, False, _curvature),
     Kind("hung_at", ("hung_s",), Of.SAMPLE, True),
     Kind("hung", ("hung_kg",), Of.SAMPLE),
+    Kind("centre_line", (), Of.POINT, True, _centre_line),  # columns x, y, z of a file without s
     Kind("base_wrench", ("base_fx", "base_fy", "base_fz", "base_mx", "base_my", "base_mz"), Of.SAMPLE, False, _base),
 )

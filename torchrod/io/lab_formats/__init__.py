@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ...util.errors import InputError, shown
 from ...util.files import reading
-from . import aurora, c3d, fbgs, luna, motive, qualisys, trc, vicon, wide
+from . import aurora, c3d, fbgs, line, luna, motive, qualisys, trc, vicon, wide
 from .convert import Imported, convert
 from .layout import Layout, read_layout
 from .recording import Recording
@@ -22,9 +22,11 @@ FORMATS: dict[str, Callable[[Path, bytes, Layout], Recording]] = {
     "fbgs": fbgs.read,
     "luna": luna.read,
     "wide": wide.read,
+    "line": line.read,
 }
 
 TIMED = ("motive", "vicon", "trc", "c3d", "aurora")  # whose files always have times
+TABLES = ("wide", "line")  # whose columns have the names that somebody gave them
 
 
 def read_recording(name: str, path: str | Path, layout: Layout) -> Recording:
@@ -47,11 +49,12 @@ def _warn_of_idle(name: str, path: Path, layout: Layout, found: Recording) -> No
     """Say of every key of the layout that has nothing to act on."""
     here = f"in {path}, a file of format {name}"
     idle = {
-        "time": layout.time is not None and name != "wide" and f"{here}, times are not in a column that has to be named",
+        "time": layout.time is not None and name not in TABLES and f"{here}, times need no name",
         "rate": layout.rate is not None and name in TIMED and f"frames {here}, have their own times",
     }
     keys = {"units": layout.units is not None, "up": layout.up != "z", "left_handed": layout.left_handed, "base": bool(layout.base)}
-    idle |= {key: given and not found.points and f"there are no positions {here}" for key, given in keys.items()}
+    nowhere = not found.points and found.line is None
+    idle |= {key: given and nowhere and f"there are no positions {here}" for key, given in keys.items()}
     for key, why in idle.items():
         if why:
             warnings.warn(f"{layout.path}: {key} has no effect: {why}", stacklevel=3)

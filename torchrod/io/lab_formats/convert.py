@@ -67,20 +67,22 @@ def convert(path: Path, found: Recording, layout: Layout, robot: Robot, base: Ba
         _check_rotations(path, raw, layout, frame)
     if layout.gratings is not None:
         shapes.append(_gratings(path, found, layout, layout.gratings))
-    joined = _joined(shapes, frames)
+    if (found.line is not None) != layout.centre_line:
+        raise InputError(f"{path}: a file of format line and [centre_line] of {layout.path} belong together; change one of them")
+    joined = _line(found.line, frame) if found.line is not None else _joined(shapes, frames)
     if not bool(on_rod(joined.s, L := robot.rod.length).all()):
         raise InputError(
             f"{layout.path}: s = {float(joined.s.max()):g} m lies outside the rod of 0 to {L:g} m; give s_mm or metres"
         )
-    if layout.markers is not None and layout.base is not None and layout.base.at is not None:
-        check_side(path, layout, joined.positions, L)
+    if (layout.markers is not None or layout.centre_line) and layout.base is not None and layout.base.at is not None:
+        check_side(path, layout, joined.points, L)
     time = None if found.time is None or not np.isfinite(found.time).all() else torch.from_numpy(found.time.copy())
     return Imported(replace(joined, samples=[str(k) for k in range(frames)], time=time), pose, frame.rms)
 
 
 def _in_metres(path: Path, found: Recording, layout: Layout) -> Recording:
     """Points in metres, right-handed, in a world whose z axis points up; rotations with them."""
-    if not found.points:
+    if not found.points and found.line is None:
         return found
     units = layout.units or found.units
     if units is None:
@@ -96,7 +98,8 @@ def _in_metres(path: Path, found: Recording, layout: Layout) -> Recording:
     for name, q in found.rotations.items():
         own = torch.from_numpy(q * ([-1.0, -1.0, 1.0, 1.0] if layout.left_handed else [1.0] * 4))  # M R M, M = diag(1, 1, -1)
         rotations[name] = product(turn.expand_as(own), own).numpy()
-    return replace(found, points=points, rotations=rotations, units="m")
+    line = None if found.line is None else scale * found.line @ (up @ mirror).T
+    return replace(found, points=points, rotations=rotations, units="m", line=line)
 
 
 def _quaternion(R: Matrix) -> Float[Tensor, "F 4"]:
@@ -149,6 +152,11 @@ def _markers(path: Path, found: Recording, layout: Layout, robot: Robot, base: B
                 f"{path}: {gone} of {p[..., 0].numel()} markers are missing: no point could be told to be theirs", stacklevel=3
             )
     return Shapes(places.s, p, [""] * len(p), places.offsets)
+
+
+def _line(points: Float[np.ndarray, "F M 3"], base: Base) -> Shapes:
+    p = _into_base(torch.from_numpy(points), base)
+    return Shapes(p.new_zeros(0), p.new_zeros(len(p), 0, 3), [""] * len(p), readings={"centre_line": p})
 
 
 def _bodies(path: Path, found: Recording, layout: Layout, base: Base) -> Shapes | None:

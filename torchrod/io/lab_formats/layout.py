@@ -15,7 +15,7 @@ from ...util.units import metres_per
 from ..base_pose import BasePose, as_base_pose
 from ..values import as_number, as_numbers, as_table, in_si, read_toml
 
-TOP = {"units", "up", "left_handed", "time", "rate", "base", "markers", "bodies", "gratings"}
+TOP = {"units", "up", "left_handed", "time", "rate", "base", "markers", "bodies", "gratings", "centre_line"}
 PLACES = {"names", "s", "offset"}
 BASE = {"names", "at", "body", "position", "rotation", "moving"}
 GRATINGS = {"s", "kx", "ky", "cores", "core", "start", "unit"}
@@ -65,7 +65,7 @@ class Gratings:
 @dataclass(frozen=True)
 class Layout:
     """The content of a LAYOUT.toml. units: of length, where the file does not say or says something else. time: column of a table.
-    rate: frames per second, where the file has no times.
+    rate: frames per second, where the file has no times. centre_line: whether the file's points are those of one.
     """
 
     path: Path
@@ -78,6 +78,7 @@ class Layout:
     markers: Places | None
     bodies: Places | None
     gratings: Gratings | None
+    centre_line: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -206,11 +207,16 @@ def read_layout(path: str | Path) -> Layout:
         "gratings": lambda value: _gratings(f"{path}: gratings", value),
     }
     parts = {key: make(table[key]) if key in table else None for key, make in made.items()}
-    if parts["markers"] is None and parts["bodies"] is None and parts["gratings"] is None:
-        raise InputError(f"{path}: names nothing on the rod; add [markers], [bodies] or [gratings]")
+    line = "centre_line" in table
+    as_table(f"{path}: centre_line", table.get("centre_line", {}), set())
+    places = [key for key in ("markers", "bodies", "gratings") if parts[key] is not None]
+    if not places and not line:
+        raise InputError(f"{path}: names nothing on the rod; add [markers], [bodies], [gratings] or [centre_line]")
+    if places and line:
+        raise InputError(f"{path}: {places[0]} stands beside centre_line, whose points are at no known s; import each by itself")
     left = _flag(f"{path}: left_handed", table.get("left_handed", False))
     if rate is not None and not math.isfinite(1 / rate):
         raise InputError(f"{path}: rate is {rate}; it must be in frames per second")
     if rate is not None and time is not None:
         raise InputError(f"{path}: time and rate both say when the frames are; give one of them")
-    return Layout(path, units, up, left, time, rate, parts["base"], parts["markers"], parts["bodies"], parts["gratings"])
+    return Layout(path, units, up, left, time, rate, parts["base"], parts["markers"], parts["bodies"], parts["gratings"], line)
