@@ -81,6 +81,15 @@ def _stiffness(std: float) -> Change:
     return change
 
 
+def _oval(std: float) -> Change:
+    def change(robot: Robot, tension: Reading, g: torch.Generator) -> tuple[Robot, Reading]:
+        a, b = _normal(g, std, 2).tolist()
+        shape = torch.tensor([[a, b, 0.0], [b, -a, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+        return replace(robot, rod=replace(robot.rod, K_bt=robot.rod.K_bt + robot.rod.bending_stiffness * shape)), tension
+
+    return change
+
+
 def _mass(std: float) -> Change:
     return lambda robot, tension, g: (replace(robot, gravity=(1 + float(_normal(g, std))) * robot.gravity), tension)
 
@@ -133,6 +142,7 @@ def rows() -> list[Row]:
             Row(f"{name}: stiffness 10 %", robot, _stiffness(0.1), Uncertainty(stiffness=0.1)),
             Row(f"{name}: mass 20 %", robot, _mass(0.2), Uncertainty(mass=0.2)),
             Row(f"{name}: set 0.2/m", robot, _set(0.2), Uncertainty(set=0.2)),
+            Row(f"{name}: oval 10 %", robot, _oval(0.1), Uncertainty(oval=0.1)),
             Row(f"{name}: gravity 5 degrees", robot, _gravity(math.radians(5)), Uncertainty(gravity=math.radians(5))),
             Row(f"{name}: frame 1 mm, 0.5 degrees", robot, _nothing, None, Registration(1e-3, math.radians(0.5))),
         ]

@@ -28,7 +28,7 @@ from torchrod.estimation.evaluator import NearlyKnownEvaluator, TorchEvaluator, 
 from torchrod.model.uncertainty import Found
 
 S = torch.linspace(0.02, 0.4, 20)
-EVERY = Uncertainty(0.03, 0.05, 0.04, 0.1, 0.1, 0.2, 0.1, 0.05, 0.2, 1e-3, 0.02)
+EVERY = Uncertainty(0.03, 0.05, 0.04, 0.1, 0.1, 0.2, 0.1, 0.05, 0.2, 1e-3, 0.02, 0.05)
 
 
 def problem_of(robot: Robot, uncertainty: Uncertainty, **unknown) -> Problem:
@@ -66,7 +66,18 @@ def test_the_parameters_are_those_that_a_robot_has():
 @pytest.mark.parametrize(
     "name",
     [
-        *("stiffness", "mass", "tension_1", "friction_2", "gravity_1", "set_y", "curvature_x_2", "tension_offset_2", "tendon_x_1"),
+        *(
+            "stiffness",
+            "mass",
+            "tension_1",
+            "friction_2",
+            "gravity_1",
+            "set_y",
+            "curvature_x_2",
+            "tension_offset_2",
+            "tendon_x_1",
+            "oval_2",
+        ),
         "metric_xz",
     ],
 )
@@ -89,6 +100,9 @@ def test_one_standard_deviation_is_a_robot_that_is_off_by_it(name, sign):
         rod = replace(rod, K_se=(1 + 0.03 * sign) * rod.K_se, K_bt=(1 + 0.03 * sign) * rod.K_bt)
     elif name == "mass":
         rod = replace(rod, mass_per_length=(1 + 0.05 * sign) * rod.mass_per_length)
+    elif name == "oval_2":
+        EI = float((rod.K_bt[0, 0] * rod.K_bt[1, 1]).sqrt())
+        rod = replace(rod, K_bt=rod.K_bt + 0.05 * sign * EI * T([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     elif name == "tension_1":
         tension = tension * T([1 + 0.04 * sign, 1.0])
     elif name == "friction_2":

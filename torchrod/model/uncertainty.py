@@ -108,13 +108,14 @@ class Found(Float64):
 class Uncertainty:
     """Standard deviations of a robot's parameters, each about what its file says; 0: exact.
 
-    stiffness, mass: relative, of the whole rod (without what hangs on it at points). tension: relative, of every tendon's
-    reading. friction: of every tendon's motion times mu. set: 1/m, a curvature of the whole unloaded rod, about x and about y.
-    curvature: 1/m, one that changes along the rod within curvature_length (m; None: a tenth of the rod): the catch-all for discs,
-    glue, tubing and backlash. gravity: rad, its direction. tension_offset: N, of every reading. tendon_place: m, of every tendon in
-    the section, along x and along y. metric: relative, a symmetric strain of measured positions, as
-    of cameras whose scale is off. found: what a calibration has left unknown, errors of the robot that come on top of the
-    others. Errors: ValueError for what is no standard deviation.
+    stiffness, mass: relative, of the whole rod (without what hangs on it at points). tension: relative, of every tendon's reading.
+    friction: of every tendon's motion times mu. set: 1/m, a curvature of the whole unloaded rod, about x and about y. curvature:
+    1/m, one that changes along the rod within curvature_length (m; None: a tenth of the rod): the catch-all for discs, glue, tubing
+    and backlash. gravity: rad, its direction. tension_offset: N, of every reading. tendon_place: m, of every tendon in the section,
+    along x and along y. metric: relative, a symmetric strain of measured positions, as of cameras whose scale is off. oval:
+    relative, by how much the rod is stiffer in bending about one axis than about the one across, whichever they are, from their
+    mean. found: what a calibration has left unknown, errors of the robot that come on top of the others. Errors: ValueError for
+    what is no standard deviation.
     """
 
     stiffness: float = 0.0
@@ -128,6 +129,7 @@ class Uncertainty:
     tension_offset: float = 0.0
     tendon_place: float = 0.0
     metric: float = 0.0
+    oval: float = 0.0
     found: Found | None = None
 
     def __post_init__(self):
@@ -136,7 +138,7 @@ class Uncertainty:
             least = value is not None and (value > 0 if name == "curvature_length" else value >= 0)
             if value is not None and not (least and value < math.inf):
                 raise ValueError(f"Uncertainty.{name} is {value}; it must be a finite standard deviation, at least 0")
-        for name in RELATIVE:
+        for name in (*RELATIVE, "metric", "oval"):
             if (share := getattr(self, name)) > MOST_SHARE:
                 raise ValueError(f"Uncertainty.{name} is {share}; it is a share, 0.05 for 5 %, and may be at most {MOST_SHARE}")
 
@@ -190,6 +192,7 @@ class Uncertainty:
         heavy = not robot.weightless
         found = [Parameter("mass", "1", std["mass"], _mass)] if heavy and bool(robot.rod.mass_per_length > 0) else []
         found.append(Parameter("stiffness", "1", std["stiffness"], _stiffness))
+        found += [Parameter(f"oval_{k + 1}", "1", std["oval"], _oval(k)) for k in range(2)]
         for j in range(len(robot.tendons)):
             found += [
                 Parameter(f"tension_{j + 1}", "1", std["tension"], _tension(j)),
@@ -229,6 +232,19 @@ def _correlation(C: Float[Tensor, "k k"]) -> Float[Tensor, "k k"]:
 def _stiffness(robot: Robot, error: float) -> Robot:
     rod = robot.rod
     return replace(robot, rod=replace(rod, K_se=(1 + error) * rod.K_se, K_bt=(1 + error) * rod.K_bt))
+
+
+def _oval(k: int) -> Change:
+    """Stiffer in bending about one axis of the section than about the one across: about x than y (k = 0), or halfway between."""
+    shape = torch.tensor(
+        [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]] if k == 0 else [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0] * 3]
+    )
+
+    def change(robot: Robot, error: float) -> Robot:
+        rod = robot.rod
+        return replace(robot, rod=replace(rod, K_bt=rod.K_bt + error * rod.bending_stiffness * shape.to(DTYPE)))
+
+    return change
 
 
 def _mass(robot: Robot, error: float) -> Robot:
