@@ -54,6 +54,8 @@ def test_the_parameters_are_those_that_a_robot_has():
     bumps = [f"curvature_{axis}_{k}" for axis in "xy" for k in range(1, 6)]
     assert set(passive) == {
         "stiffness",
+        "oval_1",
+        "oval_2",
         "set_x",
         "set_y",
         *bumps,
