@@ -24,11 +24,13 @@ from torchrod import (
     Settings,
     Start,
     Status,
+    Unknowns,
     estimate,
     paper_settings,
     solve_shape,
 )
 from torchrod.estimation import solve as estimator
+from torchrod.estimation.result import Z95, _interval
 from torchrod.estimation.solve import linearize
 
 
@@ -75,6 +77,23 @@ def test_the_interval_of_a_force_that_is_not_there_reaches_zero():
     assert fit.accepted[0]
     assert fit.magnitude[0, 0] < fit.magnitude_std[0, 0]
     assert fit.magnitude_interval[0, 0, 0] == 0
+
+
+def test_an_interval_is_symmetric_in_the_logarithm_only_where_that_is_known():
+    """A number whose relative error is 0.6 may be zero: 1 - 1.96 x 0.6 < 0; with 0.4 it may not."""
+    value, std = T([[1.0, 1.0]]), T([[0.6, 0.4]])
+    found = _interval(value, std)[0]
+    assert found[0].tolist() == pytest.approx([0.0, 1 + Z95 * 0.6])
+    assert found[1].tolist() == pytest.approx([math.exp(-Z95 * 0.4), math.exp(Z95 * 0.4)])
+
+
+def test_as_many_numbers_as_unknowns_are_enough():
+    """One marker and a force at the tip: three numbers each; with one coordinate less the sample is not fitted."""
+    rod, s = steel_rod(), T([0.4])
+    unknowns = Unknowns(GaussianCoordinates(0, 0.4, rod.rod.force_scale), tip="force")
+    p = T([[[0.05, 0.0, 0.395]]])
+    assert Problem(rod, unknowns, [Markers(s, p, 1e-3)]).usable.tolist() == [True]
+    assert Problem(rod, unknowns, [Markers(s, p.masked_fill(p == 0, torch.nan), 1e-3)]).usable.tolist() == [False]
 
 
 @pytest.mark.many_fits

@@ -10,7 +10,9 @@ from studies import contacts
 from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
 from torchrod import GaussianLoads, Markers, PointForces, PointWrenches, Problem, estimate, score_test, solve_shape
+from torchrod.analysis.score_test import start_with_one_more
 from torchrod.cli import main
+from torchrod.estimation.evaluator import evaluator
 
 S = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
 ROD = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\n"
@@ -118,3 +120,14 @@ def test_a_contact_and_a_push_at_the_tip_are_told_from_two_contacts_and_a_push(t
     results = run(tmp_path, markers, "--contacts", "auto", "--unknown-tip", "force", "--noise", "2e-4")
     right = [sample["evidence"]["chosen"] == "1 + tip force" for sample in results]
     assert sum(right) >= 20
+
+
+def test_the_start_of_one_more_load_costs_less_than_the_fit_that_was_tested():
+    """(4) of the score test: the fitted load and the base wrench move with the new force, to first order to where it fits."""
+    rod, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    push = PointForces(T([[[0.015, 0.0, 0.0], [0.0, 0.0125, 0.0]]]), T([[0.2, 0.35]]))
+    p = solve_shape(rod, (push,), None, s, 1).p
+    one, two = (Problem(rod, unknowns_of(rod, k, "contact"), [Markers(s, p, 5e-5)]) for k in (1, 2))
+    fit = estimate(one)
+    start = start_with_one_more(two.unknowns, score_test(one, fit.x))
+    assert float(evaluator(two).cost(start.x)) < 0.8 * float(fit.cost)
