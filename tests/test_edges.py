@@ -71,6 +71,17 @@ def test_no_slack_at_the_tip_takes_up_a_load(ratio, noise):
         assert 0.75 < float(z.square().mean().sqrt()) < 1.25
 
 
+def test_pushes_along_the_soft_side_of_a_flat_backbone_are_found():
+    """A thousandth of the rod's force scale, which is that of both sides together: 31 of 40 once."""
+    robot, generator, B = strip(1e6), torch.Generator().manual_seed(11), 40
+    _, _, load = pushed_along_x(robot, B, generator)
+    s = torch.linspace(L / 20, L, 20)
+    p = solve_shape(robot, load, None, s, B, steps=160).p
+    markers = Markers(s, p + 1e-2 * L * torch.randn(p.shape, generator=generator), 1e-2 * L)
+    fit = estimate(Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale)), [markers]))
+    assert fit.accepted.sum() >= 36
+
+
 @pytest.mark.parametrize("noise", [1e-4, 1e-6, 1e-9, 1e-12])
 @pytest.mark.parametrize("kind", ["round", "curved", "tendons"])
 def test_exact_markers_are_explained_whatever_noise_is_stated(kind, noise):

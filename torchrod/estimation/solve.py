@@ -276,7 +276,7 @@ class Basins:
         if bool(fit.accepted.all()):
             return fit
         elsewhere = getattr(problem.unknowns.loads, "elsewhere", None)  # a family of a user's own need not have it
-        if not self.most or elsewhere is None or not len(gammas := elsewhere()):
+        if not self.most or elsewhere is None or not len(gammas := elsewhere(problem.robot.rod.sides)):
             return fit
         limits = torch.tensor([WRONG * limit(dof) for dof in fit.dof.tolist()], dtype=DTYPE)
         wrong = problem.usable & wanted & ~((fit.status == int(Status.CONVERGED)) & (fit.chi2 < limits))

@@ -91,15 +91,16 @@ class GaussianCoordinates:
         eta = each[..., 2:-1].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
         return torch.cat([factor * each[..., :2], eta, torch.full_like(each[..., -1:], self._log_c())], -1).flatten(-2)
 
-    def elsewhere(self) -> Float[Tensor, "C n"]:
+    def elsewhere(self, sides: tuple[float, float] = (1.0, 1.0)) -> Float[Tensor, "C n"]:
         """A single load of several sizes, places and directions (C, n), where to look when a fit is plainly wrong.
 
-        None, (0, n), for more loads, or for one whose place is known.
+        sides: Rod.sides; a push along the soft side of a flat backbone is of its own scale. None, (0, n), for more loads, or for
+        one whose place is known.
         """
         if self.count != 1 or self.locations is not None:
             return torch.empty(0, self.size, dtype=DTYPE)
         force, eta = single_loads()
-        return torch.cat([force, torch.stack([eta, torch.full_like(eta, self._log_c())], -1)], -1)
+        return torch.cat([force * force.new_tensor(sides), torch.stack([eta, torch.full_like(eta, self._log_c())], -1)], -1)
 
     def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
         """gamma + step where a force or a place is hardly known; else along [log |F|, direction, log location, log c].

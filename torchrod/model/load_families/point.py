@@ -46,12 +46,12 @@ class PointCoordinates:
         eta = each[..., 2:].clamp(-ETA_OF_RESTART, ETA_OF_RESTART)
         return torch.cat([factor * each[..., :2], eta], -1).flatten(-2)
 
-    def elsewhere(self) -> Float[Tensor, "C n"]:
+    def elsewhere(self, sides: tuple[float, float] = (1.0, 1.0)) -> Float[Tensor, "C n"]:
         """As in GaussianCoordinates."""
         if self.count != 1 or self.locations is not None:
             return torch.empty(0, self.size, dtype=DTYPE)
         force, eta = single_loads()
-        return torch.cat([force, eta.unsqueeze(-1)], -1)
+        return torch.cat([force * force.new_tensor(sides), eta.unsqueeze(-1)], -1)
 
     def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
         """gamma + step."""
