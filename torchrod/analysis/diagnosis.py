@@ -109,7 +109,8 @@ class Diagnosis:
         if bool(torch.isfinite(self.couple[sample])):
             said.append(
                 f"The shape asks for something that is not a contact near s = {1e3 * float(self.couple[sample]):.3g} mm: two large "
-                "opposite forces side by side; check the section, the stiffness and the reference shape there."
+                "opposite forces side by side, neither of which is known; check the section, the stiffness and the reference shape "
+                "there, or, where two opposite pushes are meant, add markers about them."
             )
         if bool(self.tip_instead[sample]):
             said.append("A force at the tip explains the shape with fewer contacts than lateral pushes alone would take.")

@@ -19,7 +19,7 @@ from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
 from ..model.load_families import GaussianCoordinates
-from ..model.problem import Problem
+from ..model.problem import FINEST, Problem
 from ..model.unknowns import Registration, Scope, Unknowns
 from ..util.errors import InputError
 from ..util.progress import bar
@@ -139,6 +139,11 @@ def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | No
     base = None if options.base_noise is None else (options.base_noise[0], options.base_noise[1])
     if options.curvature_noise is not None:
         positive("--curvature-noise", options.curvature_noise)
+    if stated < FINEST * rod.length:
+        warnings.warn(
+            f"--noise {stated:g} m counts as {FINEST * rod.length:.2g} m for markers: steps along the rod leave as much",
+            stacklevel=2,
+        )
     noises = Noises(stated, angle, base, options.curvature_noise)
     try:
         unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.of_a_sample)

@@ -60,6 +60,17 @@ def follows(problem: Problem, x: Float[Tensor, "B n"], wanted: Bool[Tensor, " B"
     return good
 
 
+def in_the_way(problem: Problem, x: Float[Tensor, "B n"]) -> Bool[Tensor, " B"]:
+    """Whether steps of this length h may keep a fit from a load that is narrower than they are.
+
+    Within a step the moment then has a kink of slope F. Simpson's rule misses up to F h^2 / 24 of its integral, that of a parabola
+    nothing, so that markers move by up to F L h^2 / (24 EI) with where in the step the load lies.
+    """
+    rod = problem.robot.rod
+    off = _bend(problem, x).sqrt() * (rod.length / problem.steps) ** 2 / (24 * rod.softest)
+    return problem.weights[:, :-TIP_ROWS].sum(-1) * off**2 > 1
+
+
 def stable(problem: Problem, x: Float[Tensor, "B n"]) -> Bool[Tensor, " B"]:
     """Whether the equilibria at x are stable: `mechanics.statics.stable_at`."""
     robot, state = problem.robot, problem.state

@@ -37,6 +37,7 @@ PAPER_SIZES, PAPER_ALPHA = (50.0, 50.0, 0.03, 10.0), (3.0, 0.07)  # of [a_x, a_y
 PAPER_RATIO = 2.0  # square root of Sigma_0 over Q
 BASINS = 3  # starts elsewhere that are tried; the best is nearly always the first
 WRONG = 10.0  # times the 99.9 % point of chi^2: more than noise that is stated too small, or a model that is slightly off
+LOWERED = 0.9  # of chi^2: what finer steps must bring a fit that is not accepted before still finer ones are tried
 RESTART_ITERATIONS = 50  # a restart that helps does so within about 30
 Progress = Callable[[int], object]
 
@@ -275,7 +276,7 @@ class Basins:
         if bool(fit.accepted.all()):
             return fit
         elsewhere = getattr(problem.unknowns.loads, "elsewhere", None)  # a family of a user's own need not have it
-        if not self.most or elsewhere is None or not len(gammas := elsewhere()):
+        if not self.most or elsewhere is None or not len(gammas := elsewhere(problem.robot.rod.sides)):
             return fit
         limits = torch.tensor([WRONG * limit(dof) for dof in fit.dof.tolist()], dtype=DTYPE)
         wrong = problem.usable & wanted & ~((fit.status == int(Status.CONVERGED)) & (fit.chi2 < limits))
@@ -384,21 +385,37 @@ def estimate_each(
 
 
 def _followed(problem: Problem, fit: Estimate, settings: Settings) -> Estimate:
-    """The fit, repeated with twice the steps as long as they move what is read; what even MOST_STEPS do not follow is said."""
-    if checks.all_follow(problem, fit.x):
+    """The fit, repeated with twice the steps as long as they move what is read; what even MOST_STEPS do not follow is said.
+
+    A fit that is not accepted may be kept from its load by the steps: it is repeated as long as that lowers chi^2. Where finer
+    steps than it began with are needed and it is not accepted with them, all that would come of a cold start with these.
+    """
+    if bool(fit.accepted.all()) and checks.all_follow(problem, fit.x):
         return fit
-    at = (~checks.follows(problem, fit.x, fit.status == int(Status.CONVERGED))).nonzero().squeeze(-1)
-    if not len(at):
-        return fit
-    solve = solver_of(replace(settings, restarts=(), basins=0))
-    part = problem.take(at)
+    hasty, thorough = solver_of(replace(settings, restarts=(), basins=0)), solver_of(settings)
+
+    def asked(problem: Problem, fit: Estimate) -> tuple[Bool[Tensor, " B"], Bool[Tensor, " B"]]:
+        """Whose readings finer steps would move, and which fits they may improve."""
+        valid = fit.status != int(Status.INVALID)
+        return ~checks.follows(problem, fit.x, valid), valid & ~fit.accepted & checks.in_the_way(problem, fit.x)
+
+    moved, hope = asked(problem, fit)
+    at = (moved | hope).nonzero().squeeze(-1)
+    part, moved = problem.take(at), moved[at]
     while len(at) and part.steps < checks.MOST_STEPS:
         part = part.with_steps(min(2 * part.steps, checks.MOST_STEPS))
-        again = solve(part, Start.at(fit.x[at], Origin.OTHER_FIT))
+        again = hasty(part, Start.at(fit.x[at], Origin.OTHER_FIT))
+        better = moved | again.accepted | (again.chi2 < LOWERED * fit.chi2[at])
+        moved, hope = asked(part, again)
+        lost = (better & ~again.accepted & ~(moved | hope)).nonzero().squeeze(-1)
+        if len(lost):
+            anew = part.take(lost)
+            again = again.improved_by(thorough(anew, cold_start(anew)), lost)
         kept = {name: getattr(fit, name) for name in ("origin", "guess", "fate", "restarts")}
-        fit = replace(fit.merged(again, at, torch.ones_like(at, dtype=torch.bool)), **kept)
-        rest = (~checks.follows(part, again.x, again.status == int(Status.CONVERGED))).nonzero().squeeze(-1)
-        part, at = part.take(rest), at[rest]
+        fit = replace(fit.merged(again, at, better), **kept)
+        rest = (moved | (hope & better)).nonzero().squeeze(-1)
+        part, at, moved = part.take(rest), at[rest], moved[rest]
+    at = at[moved]
     return replace(fit, coarse=fit.coarse.index_fill(0, at, True), accepted=fit.accepted.index_fill(0, at, False))
 
 

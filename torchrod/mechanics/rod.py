@@ -128,6 +128,12 @@ class Rod(Float64):
         return float((self.K_bt[0, 0] * self.K_bt[1, 1]).detach().sqrt())
 
     @property
+    def sides(self) -> tuple[float, float]:
+        """How stiff the rod is against forces along x and y, in units of EI: 1 and 1 for a round section."""
+        about_x, about_y = self.K_bt.detach().diagonal()[:2].tolist()
+        return about_y / self.bending_stiffness, about_x / self.bending_stiffness
+
+    @property
     def force_scale(self) -> float:
         """4 EI / L^2 (N): a force that bends the rod visibly; 1 N for the paper's rod, so that the paper's units carry over."""
         return 4 * self.bending_stiffness / self.length**2

@@ -31,6 +31,7 @@ from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
 TIP_ROWS = 6
+FINEST = 5e-7  # of the length: the least noise of a marker. What steps and round-off leave must not decide a verdict
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
 _states = Kept(256)
@@ -129,8 +130,12 @@ class Problem(Float64):
 
     @cached_property
     def weights(self) -> Float[Tensor, "B z"]:
-        """The diagonal of W: 1 / variance of what was read, 0 for what was not, then the tip residual's."""
-        own = [sensor.weights for sensor in self.sensors]
+        """The diagonal of W: 1 / variance of what was read, 0 for what was not, then the tip residual's.
+
+        A noise of markers below FINEST of the length counts as that.
+        """
+        finest = (FINEST * self.robot.rod.length) ** -2
+        own = [sensor.weights.clamp(max=finest) if isinstance(sensor, Markers) else sensor.weights for sensor in self.sensors]
         return torch.cat([*own, self.tip_weights.expand(self.batch, TIP_ROWS)], -1)
 
     @cached_property

@@ -133,14 +133,16 @@ class GaussianCoordinates:
         """The entries of one load (force scales) at an unknown place."""
         return self._joined(force, eta.unsqueeze(-1))
 
-    def elsewhere(self) -> Float[Tensor, "C n"]:
+    def elsewhere(self, sides: tuple[float, float] = (1.0, 1.0)) -> Float[Tensor, "C n"]:
         """A single load of several sizes, places and directions (C, n), where to look when a fit is plainly wrong.
 
-        None, (0, n), for more loads, or for one whose place is known.
+        sides: Rod.sides; a push along the soft side of a flat backbone is of its own scale. None, (0, n), for more loads, or for
+        one whose place is known.
         """
         if self.count != 1 or self.locations is not None:
             return torch.empty(0, self.size, dtype=DTYPE)
-        return self.one_more(*single_loads())
+        force, eta = single_loads()
+        return self.one_more(force * force.new_tensor(sides), eta)
 
     def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
         """gamma + step where a force or a place is hardly known; else along [log |F|, direction, log location, log c].

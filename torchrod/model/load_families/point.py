@@ -70,12 +70,12 @@ class PointCoordinates:
     def _joined(self, force: Float[Tensor, "... 2"], eta: Float[Tensor, "... e"]) -> Float[Tensor, "... p"]:
         return torch.cat([force, eta, force.new_zeros(*force.shape[:-1], int(self.friction is not None))], -1)
 
-    def elsewhere(self) -> Float[Tensor, "C n"]:
+    def elsewhere(self, sides: tuple[float, float] = (1.0, 1.0)) -> Float[Tensor, "C n"]:
         """As in GaussianCoordinates."""
         if self.count != 1 or self.locations is not None:
             return torch.empty(0, self.size, dtype=DTYPE)
         force, eta = single_loads()
-        return self._joined(force, eta.unsqueeze(-1))
+        return self._joined(force * force.new_tensor(sides), eta.unsqueeze(-1))
 
     def moved(self, gamma: Gamma, step: Gamma, std: Gamma) -> Gamma:
         """gamma + step."""
