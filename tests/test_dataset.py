@@ -136,6 +136,8 @@ def test_a_cluster_that_is_not_there(tmp_path, made, capsys, monkeypatch):
         main(["simulate-dataset", str(tmp_path / "d.toml"), "--out", str(tmp_path / "d"), "--scheduler", "tcp://127.0.0.1:9"]) == 2
     )
     assert "cannot be reached" in capsys.readouterr().err
+    assert main(["simulate-dataset", str(tmp_path / "d.toml"), "--out", str(tmp_path / "d"), "--scheduler", "foo://bar"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     assert (
         main(["simulate-dataset", str(tmp_path / "d.toml"), "--out", str(tmp_path / "d"), "--scheduler", "tcp://127.0.0.1:9"]) == 2

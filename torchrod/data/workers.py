@@ -101,10 +101,13 @@ def _cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
     """The cluster as an executor, and how many shards to have under way on it: it may grow and shrink meanwhile."""
     try:
         from distributed import Client, KilledWorker
+        from distributed.comm.addressing import parse_address
+        from distributed.comm.registry import get_backend
     except ImportError:
         raise InputError("--scheduler needs dask.distributed; install it with: pip install torchrod[scale]") from None
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # of a connection that is lost we tell in one sentence
     try:
+        get_backend(parse_address(address)[0])  # a client that was made in vain complains of that when it goes
         client: Any = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: cannot be reached ({error}); give the address of a dask scheduler") from None

@@ -28,6 +28,7 @@ from ...util.status import Status
 BENDS = (0.5, 1.0, 1.75, 2.5, 3.5, 4.5)  # rad over the length, of the rods that are tried
 DIRECTIONS = 12
 ROUNDS = 6
+NOISE = 0.5  # of half the distance between markers, that noise may add to their distances
 STRETCH = 1.02  # markers may be this much farther apart than the rod is long between them
 CHORD, SHORT = 0.75, 0.35  # of the arc between markers is their distance at least, where it is at most so much of the length
 LOST = 0.6  # of the markers that were there: with fewer a frame is begun anew
@@ -112,11 +113,11 @@ def _possible(rod: Rod, found: Int[np.ndarray, " P"], points: Float[np.ndarray, 
         at = np.flatnonzero(found >= 0)
         p = points[found[at]]
         apart = np.linalg.norm(p[:, None] - p[None], axis=-1)
-        most = STRETCH * np.abs(rod.s[at][:, None] - rod.s[at]) + reach[at][:, None] + reach[at] + 0.1 * rod.gate
+        most = STRETCH * np.abs(rod.s[at][:, None] - rod.s[at]) + reach[at][:, None] + reach[at] + NOISE * rod.gate
         bad = (apart > most).sum(-1)
         along = np.diff(rod.s[at], prepend=0.0)
         chord = np.linalg.norm(np.diff(p, axis=0, prepend=0.0), axis=-1)
-        slack = reach[at] + np.append(0.0, reach[at][:-1]) + 0.1 * rod.gate
+        slack = reach[at] + np.append(0.0, reach[at][:-1]) + NOISE * rod.gate
         near = (chord < CHORD * along - slack) & (along < SHORT * rod.s.max())
         bad = bad + near + np.append(near[1:], False)
         bad = bad + (np.linalg.norm(p, axis=-1) > STRETCH * rod.s[at] + reach[at] + 0.5 * rod.gate)
