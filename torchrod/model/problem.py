@@ -369,7 +369,8 @@ class Problem(Float64):
         loads, robot = self.unknowns.loads.loads(x[..., self.state.loads.at]), self.robot
         if robot.tendons.friction is not None:
             raise ValueError(
-                "strains are not worked out where tendons rub; leave out curvatures and uncertain arc lengths, or friction"
+                "curvatures, strains and uncertain arc lengths are not worked out where tendons rub; remove friction from "
+                "[[tendons]], or leave those readings out"
             )
         table = stage_table(robot, loads, self.pulling(x), Places(self.s[at])).stage(0)
         q = shape.q[..., at, :]
