@@ -115,7 +115,7 @@ def _same(a: Robot, b: Robot) -> bool:
         rods += [(getattr(a.rod.pieces, f.name), getattr(b.rod.pieces, f.name)) for f in fields(a.rod.pieces)]
     tendons = len(a.tendons) == len(b.tendons) and all(
         t.routing == u.routing
-        and (t.ends_at, t.friction, t.motion) == (u.ends_at, u.friction, u.motion)
+        and (t.ends_at, t.friction, t.motion, t.discs) == (u.ends_at, u.friction, u.motion, u.discs)
         and abs(t.tension_offset - u.tension_offset) <= SAME * abs(t.tension_offset) + 1e-300
         for t, u in zip(a.tendons.tendons, b.tendons.tendons, strict=True)
     )
