@@ -127,7 +127,7 @@ def kernel_serves(problem: Problem) -> bool:
     if family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
     if family == "point":
-        straight = all(len(t.routing) == 1 for t in robot.tendons.tendons)
+        straight = all(len(t.routing) == 1 and not t.discs for t in robot.tendons.tendons)
         return kernel.available() and straight and len(robot.rod.reference_curvature) == 1 and robot.rod.pieces is None
     return kernel.available()
 

@@ -30,7 +30,7 @@ RUBBER, SLENDER = 1e6, 1 / 40  # Pa, and a diameter over the length: so soft and
 MOST_COILS = 200  # turns of the unloaded rod
 ROD_LENGTHS = {"length", "diameter", "inner_diameter", "axes"}
 SECTION_LENGTHS = {"to", "diameter", "inner_diameter", "axes"}
-TENDON_LENGTHS = {"offset", "routing", "ends_at", "radius"}
+TENDON_LENGTHS = {"offset", "routing", "ends_at", "radius", "discs"}
 TENDON_KEYS = TENDON_LENGTHS | {"angle", "tension_offset", "friction", "motion"}
 MOTIONS = {"pull": 1.0, "release": -1.0}
 
@@ -267,6 +267,18 @@ def _motion(where: str, value: object) -> float:
     return float(value)
 
 
+def _discs(where: str, value: object, length: float) -> tuple[float, ...]:
+    """Arc lengths of the discs that a tendon runs through."""
+    if not isinstance(value, list):
+        raise InputError(f"{where} is {shown(value)}; it must be a list of arc lengths in metres")
+    found = as_numbers(where, value, len(value))
+    if any(b <= a for a, b in pairwise([0.0, *found])) or (found and found[-1] > length * (1 + 1e-9)):
+        raise InputError(
+            f"{where} is {shown(value)}; arc lengths must increase from above 0 to at most the rod's length, {length} m"
+        )
+    return tuple(min(s, length) for s in found)
+
+
 def _tendon(where: str, value: object, length: float) -> Tendon:
     table = as_table(where, in_si(where, value, TENDON_LENGTHS, {"angle"}), TENDON_KEYS)
     if ("radius" in table) != ("angle" in table):
@@ -291,7 +303,8 @@ def _tendon(where: str, value: object, length: float) -> Tendon:
             )
         tendon = Tendon(tuple((s, x, y) for s, x, y in rows), ends_at, correction)
     mu = as_number(f"{where}.friction", table.get("friction", 0.0), least=0.0)
-    tendon = replace(tendon, friction=mu, motion=_motion(f"{where}.motion", table.get("motion", 1.0)))
+    discs = _discs(f"{where}.discs", table.get("discs", []), length)
+    tendon = replace(tendon, friction=mu, motion=_motion(f"{where}.motion", table.get("motion", 1.0)), discs=discs)
     if max(math.hypot(x, y) for _, x, y in tendon.routing) > 0.5 * length:
         warnings.warn(f"{where} runs more than half the rod's length beside it; are its offsets in metres?", stacklevel=2)
     return tendon

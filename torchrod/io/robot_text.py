@@ -125,7 +125,7 @@ def _same(a: Robot, b: Robot) -> bool:
     if a.rod.pieces is not None and b.rod.pieces is not None:
         rods += [(getattr(a.rod.pieces, f.name), getattr(b.rod.pieces, f.name)) for f in fields(a.rod.pieces)]
     tendons = len(a.tendons) == len(b.tendons) and all(
-        t.ends_at == u.ends_at
+        (t.ends_at, t.discs) == (u.ends_at, u.discs)
         and close(torch.tensor(t.routing), torch.tensor(u.routing))
         and abs(t.friction * t.motion - u.friction * u.motion) <= SAME
         and abs(t.tension_gain - u.tension_gain) <= SAME

@@ -44,7 +44,7 @@ class CKnown(ctypes.Structure):
     _fields_ = [
         *((n, _I) for n in ("steps", "tendons", "newton", "diagonal", "varying")),
         *((n, CTable) for n in ("K_se", "K_bt", "K_se_inverse", "K_bt_inverse")),
-        *((n, CTable) for n in ("h", "Gm", "Wn", "Wm", "u_star", "L", "dr", "tau", "ddr")),
+        *((n, CTable) for n in ("h", "Gm", "Wn", "Wm", "u_star", "L", "dr", "tau", "ddr", "chord")),
         ("friction", _P),
         ("at", CPlaces),
         ("outputs", _I),
@@ -202,7 +202,7 @@ def available() -> bool:
 # Tensors that may have a row per sample, and their dimensions when they have none.
 SHARED_DIMENSIONS = {
     **{"K_se": 4, "K_bt": 4, "K_se_inverse": 4, "K_bt_inverse": 4},
-    **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "ddr": 4, "tau": 3},
+    **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "ddr": 4, "chord": 4, "tau": 3},
     **{"at": 1, "s": 2, "inside": 2, "node": 1, "weight": 1, "active": 3, "mean": 1, "precision": 1},
 }
 # What the kernel reads and writes at an address: double, but for these.

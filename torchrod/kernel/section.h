@@ -86,6 +86,81 @@ inline void balance(const Known& m, const Stiffness& K, const Stage& at, const V
     }
 }
 
+// tendons.py, chords: the wrench (6) of unit tension of tendon t, and, unless null, how it moves with the strains x, (6, 6).
+inline void chord(const Stage& at, int64_t t, const V* x, V* g, V* dg) {
+    const V *L = at.L + 18 * t, *c = at.chord + 4 * t;
+    const V3 u = part(x + 3), dr = part(at.dr + 3 * t), r{L[11], -L[5], V{}};
+    V3 T = dr;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 6; j++) T.c[i] += L[6 * i + j] * x[j];
+    const V3 turning = T + dr, a = cross(u, turning) + part(at.ddr + 3 * t), b = cross(u, a);
+    const V3 along = T + c[1] * a + c[2] * b, q = r + c[0] * a + c[3] * b;
+    const V per = 1.0 / root(dot(along, along));
+    const V3 d = per * along, arm = cross(q, d);
+    for (int i = 0; i < 3; i++) g[i] = d.c[i], g[3 + i] = arm.c[i];
+    for (int j = 0; dg && j < 6; j++) {
+        const V3 dT{L[j], L[6 + j], L[12 + j]};
+        V3 da = cross(u, dT), db{};
+        V3 axis{};
+        if (j >= 3) axis.c[j - 3] = splat(1.0), da = da + cross(axis, turning), db = cross(axis, a);
+        db = db + cross(u, da);
+        const V3 d_along = dT + c[1] * da + c[2] * db, dq = c[0] * da + c[3] * db;
+        const V3 dd = per * (d_along - dot(d, d_along) * d), d_arm = cross(dq, d) + cross(q, dd);
+        for (int i = 0; i < 3; i++) dg[6 * i + j] = dd.c[i], dg[6 * (3 + i) + j] = d_arm.c[i];
+    }
+}
+
+// tendons.py, chord_inverse: of a matrix that need not be symmetric, by blocks [[A, B], [C, D]].
+INLINE void chord_inverse(const V* J, V* inverse) {
+    V A[9], B[9], C[9], D[9], Ainv[9], left[9], right[9], S[9], both[9], top[9];
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            A[3 * i + j] = J[6 * i + j], B[3 * i + j] = J[6 * i + 3 + j];
+            C[3 * i + j] = J[6 * (3 + i) + j], D[3 * i + j] = J[6 * (3 + i) + 3 + j];
+        }
+    inverse3(A, Ainv);
+    product3(C, Ainv, left), product3(Ainv, B, right), product3(C, right, both);
+    for (int i = 0; i < 9; i++) D[i] -= both[i];
+    inverse3(D, S);
+    product3(S, left, both), product3(right, both, top), product3(right, S, A);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            inverse[6 * i + j] = Ainv[3 * i + j] + top[3 * i + j], inverse[6 * i + 3 + j] = -A[3 * i + j];
+            inverse[6 * (3 + i) + j] = -both[3 * i + j], inverse[6 * (3 + i) + 3 + j] = S[3 * i + j];
+        }
+}
+
+// tendons.py, balanced_strains, where tendons run from disc to disc.
+inline void balance_chords(const Known& m, const Stiffness& K, const Stage& at, const V* tau, const V* w, Balance& b) {
+    const V star[6] = {V{}, V{}, splat(1.0), at.u_star.c[0], at.u_star.c[1], at.u_star.c[2]};
+    for (int i = 0; i < 6; i++) b.x[i] = star[i];
+    for (int iteration = 0; iteration <= m.newton; iteration++) {
+        V misfit[6], J[36], dg[36], step[6];
+        for (int i = 0; i < 36; i++) J[i] = V{};
+        for (int i = 0; i < 3; i++) {
+            misfit[i] = w[i], misfit[3 + i] = w[3 + i];
+            for (int j = 0; j < 3; j++) {
+                misfit[i] -= K.se[3 * i + j] * (b.x[j] - star[j]);
+                misfit[3 + i] -= K.bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
+                J[6 * i + j] = K.se[3 * i + j], J[6 * (3 + i) + 3 + j] = K.bt[3 * i + j];
+            }
+        }
+        const bool last = iteration == m.newton;
+        for (int64_t t = 0; t < m.tendons; t++) {
+            V* g = b.g + 6 * t;
+            chord(at, t, b.x, g, last ? nullptr : dg);
+            for (int j = 0; j < 6; j++) misfit[j] -= tau[t] * g[j];
+            for (int k = 0; !last && k < 36; k++) J[k] += tau[t] * dg[k];
+        }
+        if (!last) chord_inverse(J, b.inverse);
+        for (int i = 0; i < 6; i++) {
+            step[i] = V{};
+            for (int j = 0; j < 6; j++) step[i] += b.inverse[6 * i + j] * misfit[j];
+        }
+        for (int i = 0; i < 6; i++) b.x[i] += step[i];
+    }
+}
+
 // tendons.py, turning_rate: Theta' of tendon t, and how it moves with the strains x, (6).
 inline V turning_rate(const Stage& at, int64_t t, const V* x, V pull, double floor, V* slope) {
     const V* L = at.L + 18 * t;
@@ -138,7 +213,8 @@ inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope
             const V left = exponential(larger(smaller(-m.friction[t] * y[STATE + t], splat(700.0)), splat(-700.0)));
             s.tau[t] *= left, s.tau_unit[t] *= left, s.fall[t] = m.friction[t] * s.tau[t];
         }
-        balance(m, *s.K, at, s.tau, w, s.balance);
+        if (m.chord.data) balance_chords(m, *s.K, at, s.tau, w, s.balance);
+        else balance(m, *s.K, at, s.tau, w, s.balance);
         s.v = part(s.balance.x), s.u = part(s.balance.x + 3);
         for (int64_t t = 0; m.friction && t < m.tendons; t++)
             dy[STATE + t] = turning_rate(at, t, s.balance.x, s.tau[t], m.friction[m.tendons], s.turn + 6 * t);

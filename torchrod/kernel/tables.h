@@ -23,7 +23,8 @@ struct Known {
     Table h;                                       // (S)
     Table Gm, Wn, Wm, u_star;                      // (S, 3, 3)
     Table L, dr, tau;                              // (S, 3, T, 18), (S, 3, T, 3), (S, 3, T)
-    Table ddr;                                     // (S, 3, T, 3), where tendons rub
+    Table ddr;                                     // (S, 3, T, 3), where tendons rub or run from disc to disc
+    Table chord;                                   // (S, 3, T, 4), where tendons run from disc to disc; or null
     const double* friction;                        // (T + 1): of every tendon, and the floor of their turning; or null
     Places at;                                     // (P) nodes of the outputs
     int64_t outputs;
@@ -67,7 +68,7 @@ inline void stiffness_of(const Known& m, const Lanes& lanes, int64_t row, Stiffn
 struct Stage {
     bool Wn_there, Wm_there;
     V3 G, Gm, Wn, Wm, u_star;
-    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], ddr[MOST_TENDONS * 3], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
+    V G2x, G2y, L[MOST_TENDONS * 18], dr[MOST_TENDONS * 3], ddr[MOST_TENDONS * 3], chord[MOST_TENDONS * 4], tau[MOST_TENDONS], tau_unit[MOST_TENDONS];
 };
 
 // One group of samples. Tangents are ordered [loads | tensions | the rest]; only the first two move what is known along the rod.
@@ -107,7 +108,8 @@ inline void stage_of(const Group& g, int64_t row, Stage& s) {
     }
     for (int64_t x = 0; x < 18 * m.tendons; x++) s.L[x] = fetch(m.L, g.lanes, row * 18 * m.tendons + x);
     for (int64_t x = 0; x < 3 * m.tendons; x++) s.dr[x] = fetch(m.dr, g.lanes, row * 3 * m.tendons + x);
-    for (int64_t x = 0; m.friction && x < 3 * m.tendons; x++) s.ddr[x] = fetch(m.ddr, g.lanes, row * 3 * m.tendons + x);
+    for (int64_t x = 0; m.chord.data && x < 4 * m.tendons; x++) s.chord[x] = fetch(m.chord, g.lanes, row * 4 * m.tendons + x);
+    for (int64_t x = 0; m.ddr.data && x < 3 * m.tendons; x++) s.ddr[x] = fetch(m.ddr, g.lanes, row * 3 * m.tendons + x);
     for (int64_t t = 0; t < m.tendons; t++) {
         s.tau[t] = fetch(m.tau, g.lanes, row * m.tendons + t);
         s.tau_unit[t] = V{};

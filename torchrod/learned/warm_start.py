@@ -174,6 +174,8 @@ def _robot_misfit(card: dict[str, Any], problem: Problem) -> str | None:
         return "it knows rods of one section without masses on them only"
     if robot.tendons.friction is not None:
         return "it knows tendons without friction only"
+    if any(t.discs for t in robot.tendons.tendons):
+        return "it knows tendons that follow the rod only, not from disc to disc"
     if not _round_and_straight(rod):
         return "it knows straight rods that bend alike in all directions only"
     ratios = {

@@ -49,13 +49,17 @@ class Actuated:
 
 
 def _stations(robot: Robot) -> Float[Tensor, "T n"]:
-    """Arc lengths (m) at which each tendon's path is sampled."""
-    ends = torch.tensor(robot.tendons.ends, dtype=torch.float64)
-    return ends.unsqueeze(-1) * torch.linspace(0, 1, CHORDS + 1, dtype=torch.float64)
+    """Arc lengths (m) at which each tendon's path is sampled: where it runs from disc to disc its holes, and then its end."""
+    n = max([CHORDS + 1, *(len(t.holes) | 1 for t in robot.tendons.tendons)])
+    even, rows = torch.linspace(0, 1, n, dtype=torch.float64), []
+    for t in robot.tendons.tendons:
+        holes = torch.tensor([*t.holes, *[t.ends_at] * (n - len(t.holes))], dtype=torch.float64)
+        rows.append(holes if t.discs else t.ends_at * even)
+    return torch.stack(rows)
 
 
 def _path_lengths(robot: Robot, stations: Float[Tensor, "T n"], shape: Equilibrium) -> Float[Tensor, "B T"]:
-    """l_j = integral of |v + u x r_j + r_j'| ds (m), as the length of the curve p(s) + R(s) r_j(s).
+    """l_j = integral of |v + u x r_j + r_j'| ds (m), as the length of the curve p(s) + R(s) r_j(s), or from disc to disc.
 
     Chords miss the arc by c h^2 + O(h^4): 4/3 of the fine sum less 1/3 of the coarse one has no c. shape: sampled at the stations
     of every tendon, one after the other, behind whatever else was asked for.
@@ -66,7 +70,8 @@ def _path_lengths(robot: Robot, stations: Float[Tensor, "T n"], shape: Equilibri
     curve = p + rotate(q, r)
     fine = curve.diff(dim=2).norm(dim=-1).sum(-1)
     coarse = curve[:, :, ::2].diff(dim=2).norm(dim=-1).sum(-1)
-    return (4 * fine - coarse) / 3
+    straight = torch.tensor([bool(t.discs) for t in robot.tendons.tendons])
+    return torch.where(straight, fine, (4 * fine - coarse) / 3)
 
 
 def reference_lengths(robot: Robot) -> Float[Tensor, " T"]:

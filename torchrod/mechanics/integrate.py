@@ -65,8 +65,10 @@ def known(
     }
     if t is not None:
         tensors |= {"L": t.L.contiguous(), "dr": t.dr.contiguous(), "tau": t.tau.contiguous()}
-        if t.friction is not None and t.ddr is not None:
-            tensors |= {"ddr": t.ddr.contiguous(), "friction": torch.cat([t.friction, t.friction.new_tensor([t.floor])])}
+        for name in ("ddr", "chord"):
+            tensors[name] = None if (x := getattr(t, name)) is None else x.contiguous()
+        if t.friction is not None:
+            tensors |= {"friction": torch.cat([t.friction, t.friction.new_tensor([t.floor])])}
     numbers = {
         "steps": grid.h.shape[-1],
         "tendons": 0 if t is None else t.tau.shape[-1],

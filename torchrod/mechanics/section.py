@@ -76,7 +76,12 @@ class StageTable:
             None
             if t is None
             else replace(
-                t, L=function(t.L, 3), dr=function(t.dr, 2), tau=function(t.tau), ddr=None if t.ddr is None else function(t.ddr, 2)
+                t,
+                L=function(t.L, 3),
+                dr=function(t.dr, 2),
+                tau=function(t.tau),
+                ddr=None if t.ddr is None else function(t.ddr, 2),
+                chord=None if t.chord is None else function(t.chord, 2),
             ),
             None if of is None else replace(of, **{name: function(getattr(of, name), 2) for name in MATRICES}),
         )

@@ -64,7 +64,7 @@ def grid_for(robot: Robot, loads: tuple[Load, ...], outputs: Float[Tensor, " P"]
     return make_grid(
         robot.rod.length,
         outputs,
-        robot.tendons.ends + robot.rod.knots,
+        robot.tendons.knots + robot.rod.knots,
         breakpoints,
         steps,
         None if robot.rod.straight else robot.rod.curvature_at,

@@ -29,7 +29,9 @@ class Tendon:
     are joined by a C2 cubic spline in s. ends_at: arc length (m) at which it is fixed to the rod.
     tension_offset, tension_gain: N and 1, what makes a reading of its load cell its tension (`Tendons.true_tension`).
     friction: mu, its coefficient of friction on the robot (`turning_rate`). motion: 1 while it is pulled, -1 while it is let out,
-    anything between where that is not known; what counts is motion times friction. Errors: ValueError for what is no tendon.
+    anything between where that is not known; what counts is motion times friction. discs: arc lengths (m) of the discs through
+    whose holes the tendon runs straight, the one where it ends and the base plate need not be among them; none: it follows the rod
+    (`chords`). Errors: ValueError for what is no tendon.
     """
 
     routing: tuple[tuple[float, float, float], ...]
@@ -38,6 +40,7 @@ class Tendon:
     friction: float = 0.0
     motion: float = 1.0
     tension_gain: float = 1.0
+    discs: tuple[float, ...] = ()
 
     def __post_init__(self):
         if not self.routing or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in self.routing):
@@ -54,11 +57,31 @@ class Tendon:
             raise ValueError(f"a tendon's friction is {self.friction}; it must be finite")
         if not -1 <= self.motion <= 1:
             raise ValueError(f"a tendon's motion is {self.motion}; it must be 1 (pulled), -1 (let out) or between")
+        object.__setattr__(self, "discs", tuple(self.discs))
+        if any(not (math.isfinite(s) and s > 0) for s in self.discs) or any(b <= a for a, b in pairwise(self.discs)):
+            raise ValueError("a tendon's discs: arc lengths must be positive, finite, and increase")
 
     @classmethod
     def straight(cls, x: float, y: float, ends_at: float, tension_offset: float = 0.0) -> "Tendon":
         """A tendon parallel to the centre line at offset (x, y) (m)."""
         return cls(((0.0, x, y),), ends_at, tension_offset)
+
+    @property
+    def holes(self) -> tuple[float, ...]:
+        """Arc lengths (m) of base plate, discs and end, between which the tendon runs straight; () where it does not."""
+        within = (s for s in self.discs if s < self.ends_at * (1 - 1e-9))
+        return (0.0, *within, self.ends_at) if self.discs else ()
+
+    def chords_at(self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."]) -> Float[Tensor, "... 4"]:
+        """c_0 .. c_3 of `chords` at s; `inside` decides in which gap. Zero where the tendon follows the rod."""
+        if not self.holes:
+            return s.new_zeros(*s.shape, 4)
+        holes = torch.tensor(self.holes, dtype=DTYPE)
+        gap = torch.searchsorted(holes[1:-1].contiguous(), inside.detach().contiguous())
+        half, x = 0.5 * (holes[gap + 1] - holes[gap]), s - 0.5 * (holes[gap + 1] + holes[gap])
+        room = half * half - x * x
+        found = torch.stack([0.5 * room, -x, 0.5 * x * x + half * half / 6, -x * room / 3], -1)
+        return found * (inside < self.ends_at).unsqueeze(-1)
 
     def offset_at(self, s: Float[Tensor, "..."]) -> tuple[Vector, Vector]:
         """r(s) (m) and r'(s) (-), section frame, third component zero; s may carry derivatives (moving nodes)."""
@@ -88,7 +111,8 @@ class TendonTable:
 
     along_j = L_j x + r'_j with L_j = [I, -hat(r_j)]: L (..., T, 3, 6), dr (..., T, 3); tau (..., T) N, zero past a tendon's end.
     newton: how many steps the strain balance takes. friction: of every tendon, (T,), with the sign of its motion, and then ddr,
-    r''_j (..., T, 3), and floor (1/m) as well; tau is then the tension at the base, where it is known.
+    r''_j (..., T, 3), and floor (1/m) as well; tau is then the tension at the base, where it is known. chord: c_0 .. c_3 of
+    `chords`, (..., T, 4), where tendons run straight between discs, and then ddr as well.
     """
 
     L: Float[Tensor, "... T 3 6"]
@@ -98,6 +122,7 @@ class TendonTable:
     friction: Float[Tensor, " T"] | None = None
     ddr: Float[Tensor, "... T 3"] | None = None
     floor: float = 0.0
+    chord: Float[Tensor, "... T 4"] | None = None
 
     def after(self, turned: Float[Tensor, "... T"]) -> "TendonTable":
         """What is left of the tensions where the tendons have turned so far (rad): tau exp(-mu Theta), the capstan's."""
@@ -120,6 +145,11 @@ class Tendons:
         return tuple(t.ends_at for t in self.tendons)
 
     @property
+    def knots(self) -> tuple[float, ...]:
+        """Those, and the discs."""
+        return tuple(sorted({*self.ends, *(s for t in self.tendons for s in t.holes[1:])}))
+
+    @property
     def friction(self) -> Float[Tensor, " T"] | None:
         """Of every tendon, with the sign of its motion; None where there is none."""
         mu = [t.friction * t.motion for t in self.tendons]
@@ -134,10 +164,12 @@ class Tendons:
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
         """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""
         reach = max(max(x * x + y * y for _, x, y in t.routing) for t in self.tendons)
+        gap = max((b - a for t in self.tendons for a, b in pairwise(t.holes)), default=0.0)
+        reach += gap * gap / 8
         pulls = tension.detach().nan_to_num(0.0).sum(-1)
         pull = pulls.max() if pulls.numel() else pulls.new_zeros(())
         ratio = pull / K_se.diagonal(dim1=-2, dim2=-1).min() + pull * reach / K_bt.diagonal(dim1=-2, dim2=-1).min()
-        return NEWTON_STEPS if bool(ratio < SOFT) else NEWTON_STEPS_SOFT
+        return NEWTON_STEPS + (gap > 0) if bool(ratio < SOFT) else NEWTON_STEPS_SOFT
 
     def table(
         self, s: Float[Tensor, "..."], inside: Float[Tensor, "..."], tension: Float[Tensor, "..."], newton: int = NEWTON_STEPS
@@ -146,9 +178,12 @@ class Tendons:
         r, dr, ddr = (torch.stack(x, -2) for x in zip(*(t.path_at(s) for t in self.tendons), strict=True))
         active = inside.detach().unsqueeze(-1) < torch.tensor(self.ends, dtype=DTYPE)
         L = torch.cat([torch.eye(3, dtype=DTYPE).expand(*r.shape, 3), -hat(r)], -1)
-        if self.friction is None:
+        mu, chord = self.friction, None
+        if any(t.discs for t in self.tendons):
+            chord = torch.stack([t.chords_at(s, inside) for t in self.tendons], -2)
+        if mu is None and chord is None:
             return TendonTable(L, dr, tension * active, newton)
-        return TendonTable(L, dr, tension * active, newton, self.friction, ddr, STRAIGHT / max(self.ends))
+        return TendonTable(L, dr, tension * active, newton, mu, ddr, 0.0 if mu is None else STRAIGHT / max(self.ends), chord)
 
 
 def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "... T 6"], Float[Tensor, "... T 1"]]:
@@ -161,6 +196,57 @@ def tendon_directions(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "..
     along = (table.L * x[..., None, None, :]).sum(-1) + table.dr
     stretch = (along * along).sum(-1, keepdim=True).sqrt()
     return (table.L * (along / stretch).unsqueeze(-1)).sum(-2), stretch
+
+
+def chords(x: Strains, table: TendonTable) -> tuple[Float[Tensor, "... T 6"], Float[Tensor, "... T 1"], Float[Tensor, "... T 6 6"]]:
+    """The wrench of unit tension g_j = [t_j, q_j x t_j] (-, m) of tendons that run straight between discs, |along_j|, and dg_j/dx.
+
+    Seen from a section of strains v, u at x = s - s_m of a gap of length 2 h about s_m, the tendon's path through holes that follow
+    the rod has the derivatives T, a, b, and the line through the two holes the direction along_j and the point q_j,
+
+        T = v + u x r + r',    a = u x (T + r') + r'',    b = u x a
+        along = T - x a + (x^2 / 2 + h^2 / 6) b,     q = r + (h^2 - x^2) / 2 a - x (h^2 - x^2) / 3 b,     t = along / |along|
+
+    to third order in h; what the strains' own change adds is odd in x and averages out. Zero coefficients: `tendon_directions`.
+    Source: Taylor's series of the path about x; docs/model.md.
+    """
+    assert table.chord is not None
+    assert table.ddr is not None
+    u, L = x[..., None, 3:], table.L
+    c0, c1, c2, c3 = (c.unsqueeze(-1) for c in table.chord.unbind(-1))
+    r = torch.stack([L[..., 1, 5], -L[..., 0, 5], torch.zeros_like(L[..., 0, 5])], -1)
+    T = (L * x[..., None, None, :]).sum(-1) + table.dr
+    a = cross(u, T + table.dr) + table.ddr
+    b = cross(u, a)
+    along, q = T + c1 * a + c2 * b, r + c0 * a + c3 * b
+    none = torch.zeros_like(hat(a))
+    turn = hat(u).expand_as(none)
+    da = _times(turn, L) - torch.cat([none, hat(T + table.dr)], -1)
+    db = _times(turn, da) - torch.cat([none, hat(a)], -1)
+    d_along = L + c1.unsqueeze(-1) * da + c2.unsqueeze(-1) * db
+    dq = c0.unsqueeze(-1) * da + c3.unsqueeze(-1) * db
+    stretch = (along * along).sum(-1, keepdim=True).sqrt()
+    t = along / stretch
+    dt = (d_along - t.unsqueeze(-1) * (t.unsqueeze(-1) * d_along).sum(-2, keepdim=True)) / stretch.unsqueeze(-1)
+    return torch.cat([t, cross(q, t)], -1), stretch, torch.cat([dt, _times(hat(q), dt) - _times(hat(t), dq)], -2)
+
+
+def _times(A: Float[Tensor, "... i k"], B: Float[Tensor, "... k j"]) -> Float[Tensor, "... i j"]:
+    """The matrix product, pointwise."""
+    return (A.unsqueeze(-1) * B.unsqueeze(-3)).sum(-2)
+
+
+def chord_inverse(
+    K_se: Matrix, K_bt: Matrix, tau: Float[Tensor, "... T"], dg: Float[Tensor, "... T 6 6"]
+) -> Float[Tensor, "... 6 6"]:
+    """Inverse (..., 6, 6) of diag(K_se, K_bt) + sum_j tau_j dg_j, which need not be symmetric, by 3 x 3 blocks [[A, B], [C, D]]."""
+    J = (tau[..., None, None] * dg).sum(-3)
+    A, B, C, D = K_se + J[..., :3, :3], J[..., :3, 3:], J[..., 3:, :3], K_bt + J[..., 3:, 3:]
+    Ainv = inverse3(A)
+    left, right = _times(C, Ainv), _times(Ainv, B)
+    S = inverse3(D - _times(C, right))
+    top = Ainv + _times(right, _times(S, left))
+    return torch.cat([torch.cat([top, -_times(right, S)], -1), torch.cat([-_times(S, left), S], -1)], -2)
 
 
 def turning_rate(x: Strains, table: TendonTable) -> Float[Tensor, "... T"]:
@@ -213,7 +299,8 @@ def balanced_strains(
         N = K_se (v - v*) + sum_j tau_j t_j(v, u),    M = K_bt (u - u*) + sum_j tau_j r_j x t_j(v, u)
 
     Newton on the convex energy from the unstrained section. Only the last step is differentiated, with its matrix held fixed:
-    exact, because dx = -J^-1 dF at the solution, and cheap. Source: docs/model.md.
+    exact, because dx = -J^-1 dF at the solution, and cheap. Tendons between discs: t_j and the arm of their moment by `chords`.
+    Source: docs/model.md.
     """
     x_star = torch.cat([v_star.expand_as(u_star), u_star], -1)
 
@@ -227,6 +314,15 @@ def balanced_strains(
     w = torch.cat([N, M], -1)
     w0, K_se0, K_bt0 = w.detach(), K_se.detach(), K_bt.detach()
     frozen = replace(table, tau=table.tau.detach())
+    if table.chord is not None:
+        x, inverse = x_star, x_star
+        for _ in range(table.newton):
+            g, _, dg = chords(x, frozen)
+            inverse = chord_inverse(K_se0, K_bt0, frozen.tau, dg)
+            x = x + (inverse * misfit(x, w0, g, frozen.tau, K_se0, K_bt0).unsqueeze(-2)).sum(-1)
+        g = chords(x, frozen)[0]
+        x = x + (inverse * misfit(x, w, g, table.tau, K_se, K_bt).unsqueeze(-2)).sum(-1)
+        return x[..., :3], x[..., 3:]
     LtL = (table.L.unsqueeze(-1) * table.L.unsqueeze(-2)).sum(-3)
     x, inverse = x_star, x_star
     for _ in range(table.newton):
