@@ -180,9 +180,10 @@ class Calibration:
         """By how much markers at s (m) are measured off: rows [s, x, y, z, std] (m) of the mean residual, and of how sure it is."""
         count = torch.isfinite(self.residual).all(-1).sum(0)
         mean = self.residual.nanmean(0)
-        spread = (self.residual - mean).square().nanmean((0, 2)).sqrt()
-        rows = torch.cat([s.unsqueeze(-1), mean, (spread / (count - 1).clamp(min=1).sqrt()).unsqueeze(-1)], -1)
-        return rows[count > 1]
+        free = (count - 1).clamp(min=0).sum().clamp(min=1)
+        spread = ((self.residual - mean).square().nansum() / (3 * free)).sqrt()  # of all markers alike
+        rows = torch.cat([s.unsqueeze(-1), mean, (spread / count.clamp(min=1).sqrt()).unsqueeze(-1)], -1)
+        return rows[count > 0]
 
 
 def calibrate(

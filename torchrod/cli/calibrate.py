@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from jsonargparse import Namespace
+from torch import Tensor
 
 from ..analysis.calibration import OFFSET, SOUGHT, STIFFNESS, Calibration
 from ..analysis.calibration import calibrate as run_calibration
@@ -28,7 +29,7 @@ from ..model.load_families import GaussianCoordinates
 from ..model.unknowns import Registration
 from ..util.errors import InputError
 from ..util.status import Status
-from .arguments import as_calibrated, noise_std, positive, writable
+from .arguments import noise_std, positive, writable
 
 USED = {"position_std", "hung", "hung_at"}
 
@@ -39,7 +40,13 @@ def calibrate(options: Namespace) -> None:
         warnings.filterwarnings("ignore", message=".*nothing hangs")  # the mass is what is sought
         robot = read_robot(options.robot)
     nearly = read_uncertainty(options.robot)
-    shapes = as_calibrated(options.shapes, read_shapes(options.shapes, robot, options.units, options.tensions), nearly.calibrated)
+    if nearly.calibrated is not None:
+        raise InputError(
+            f"{options.robot}: has been calibrated; give calibrate the file it was made from, or take out [calibration]"
+        )
+    shapes = read_shapes(options.shapes, robot, options.units, options.tensions)
+    if options.marker_offsets and len(shapes.s.unique()) < len(shapes.s):
+        raise InputError(f"{options.shapes}: several markers have one s, so --marker-offsets cannot be written; leave it out")
     if "centre_line" in shapes.readings:
         raise InputError(f"{options.shapes}: calibrate reads markers, at known s; a centre line alone does not serve")
     if unused := sorted(set(shapes.readings) - USED):
@@ -65,7 +72,7 @@ def calibrate(options: Namespace) -> None:
     if options.json:
         write_calibration(options.json, found, shapes.samples, robot.name, options.noise)
     if options.out:
-        _write_robot(options, robot, found, shapes, nearly)
+        _write_robot(options, robot, found, shapes)
 
 
 def _sought(options: Namespace, robot: Robot, shapes: Shapes, nearly: NearlyKnown) -> dict[str, Any]:
@@ -73,12 +80,16 @@ def _sought(options: Namespace, robot: Robot, shapes: Shapes, nearly: NearlyKnow
     if options.contacts < 0:
         raise InputError(f"--contacts is {options.contacts}; it must be at least 0")
     free = list(options.free or [])
-    shared = None if nearly.shared is None else replace(nearly.shared, **dict.fromkeys({*free} & {*SOUGHT}, 0.0))
+    plain = {"mass": options.hold_mass, "stiffness": options.youngs_modulus, "tension_offset": options.tension_offset}
+    without = {*free} & {*SOUGHT} | {kind for kind, asked in plain.items() if asked}  # free, or held: no prior
+    shared = None if nearly.shared is None else replace(nearly.shared, **dict.fromkeys(without, 0.0))
     frame = Registration() if "frame" in free else nearly.shared_frame
     weight, place = shapes.readings.get("hung"), shapes.readings.get("hung_at")
     if (weight is None) != (place is None):
         missing = "hung_kg" if weight is None else "hung_s"
         raise InputError(f"{options.shapes}: {missing} is missing; a known weight needs hung_s (m) and hung_kg (kg)")
+    if weight is not None and place is not None:
+        _check_weights(options, shapes, weight[:, 0], place[:, 0], robot.rod.length)
     stated = shared is not None and (shared.mass > 0 or not bool(robot.gravity.any()))
     return {
         "youngs_modulus": options.youngs_modulus,
@@ -93,17 +104,28 @@ def _sought(options: Namespace, robot: Robot, shapes: Shapes, nearly: NearlyKnow
     }
 
 
+def _check_weights(options: Namespace, shapes: Shapes, kg: Tensor, s: Tensor, L: float) -> None:
+    """Refuse a known weight that hangs nowhere, or is none."""
+    heavy = torch.nan_to_num(kg, 0.0) != 0
+    for bad, what in (
+        (heavy & ~(kg > 0), "hung_kg must be at least 0"),
+        (heavy & ~((s >= 0) & (s <= L * (1 + 1e-9))), f"hung_s must say where on the rod of 0 to {L:g} m the weight hangs"),
+    ):
+        if bool(bad.any()):
+            raise InputError(f"{options.shapes}: sample {shapes.samples[int(bad.nonzero()[0])]}: {what}")
+
+
 def _few(names: list[str]) -> str:
     return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
 
 
-def _write_robot(options: Namespace, robot: Robot, found: Calibration, shapes: Shapes, nearly: NearlyKnown) -> None:
+def _write_robot(options: Namespace, robot: Robot, found: Calibration, shapes: Shapes) -> None:
     """The calibrated robot file; none where the calibration has nothing to say."""
     if found.status is not Status.CONVERGED or found.undetermined:
         warnings.warn(f"{options.out}: not written, because the values are not known; see the message", stacklevel=2)
         return
     factor, offsets = found.value(STIFFNESS, 1.0), any(name.startswith(OFFSET) for name in found.names)
-    calibrated = calibrated_by(found, nearly.calibrated, options.noise, shapes.s, options.marker_offsets)
+    calibrated = calibrated_by(found, options.noise, shapes.s if options.marker_offsets else None)
     write_calibrated(options.out, options.robot, found.applied(robot), factor, offsets, calibrated)
 
 

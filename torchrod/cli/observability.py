@@ -69,7 +69,7 @@ def observability(options: Namespace) -> None:
         write_observability_table(options.csv, seen)
     if options.json:
         pulled = [] if tension is None else tension.tolist()
-        write_observability(options.json, seen, s.tolist(), robot.name, options.noise, pulled, options.registration, placed)
+        write_observability(options.json, seen, s.tolist(), robot.name, options.noise, pulled, registration is not None, placed)
     if options.out:
         _draw(options, robot, seen, s, placed, lambda layout: asked(layout, uncertainty=uncertainty))
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..data.shards import has_shard, prepare_folder, write_manifest
 from ..data.spec_file import read_dataset_spec
 from ..data.workers import produce
-from ..io import Shapes, read_robot, write_shapes
+from ..io import Shapes, read_robot, read_uncertainty, write_shapes
 from ..mechanics.actuation import solve_displacement
 from ..mechanics.loads import Load, PointForces, PointWrenches
 from ..mechanics.robot import Robot
@@ -53,7 +53,10 @@ def simulate(options: Namespace) -> None:
     if Status(int(shape.status[0])) is not Status.CONVERGED:
         raise InputError(f"{options.robot}: {_why(options, robot, shape)}")
     noise = options.noise * torch.randn(shape.p.shape, generator=torch.Generator().manual_seed(options.seed), dtype=DTYPE)
-    write_shapes(options.out, Shapes(s, shape.p + noise, ["0"], None, tensions))
+    shapes = Shapes(s, shape.p + noise, ["0"], None, tensions)
+    if (calibrated := read_uncertainty(options.robot).calibrated) is not None:
+        shapes = shapes.measured(calibrated.zeta, calibrated.markers)
+    write_shapes(options.out, shapes)
     tip = [f"{v * 1e3:.2f}" for v in shape.p[0, -1].tolist()]
     pulled = f", tensions {', '.join(f'{t:.3f}' for t in tensions[0].tolist())} N" if tensions is not None else ""
     print(f"{options.out}: {len(at)} markers, the last at ({', '.join(tip)}) mm{pulled}")  # noqa: T201
@@ -122,7 +125,10 @@ def _displaced(
 ) -> tuple[Equilibrium, Tensor]:
     """The shape with so much of every tendon pulled out, and what its load cells read (1, T) N."""
     answer = solve_displacement(robot, loads, torch.tensor([displacement], dtype=DTYPE), s, steps)
-    reading = answer.tension - torch.tensor([t.tension_offset for t in robot.tendons.tendons], dtype=DTYPE)
+    offset, gain = (
+        torch.tensor([getattr(t, f"tension_{k}") for t in robot.tendons.tendons], dtype=DTYPE) for k in ("offset", "gain")
+    )
+    reading = (answer.tension - offset) / gain
     if bool((reading < 0).any()):
         raise InputError("a slack tendon's load cell would read less than 0 N, by its tension_offset; set that to 0 to simulate")
     return answer.equilibrium, reading

@@ -122,6 +122,7 @@ def _robot_record(robot: Robot) -> dict[str, object]:
         "tendons": [
             {"routing": t.routing, "ends_at": t.ends_at}
             | ({"tension_offset": t.tension_offset} if t.tension_offset else {})
+            | ({"tension_gain": t.tension_gain} if t.tension_gain != 1 else {})
             | ({"friction": t.friction, "motion": t.motion} if t.friction else {})
             | ({"discs": t.discs} if t.discs else {})
             for t in robot.tendons.tendons

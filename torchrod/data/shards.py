@@ -204,7 +204,7 @@ def _robot(record: dict[str, Any]) -> Robot:
         Tendon(
             tuple((s, x, y) for s, x, y in t["routing"]),
             t["ends_at"],
-            **{name: t[name] for name in ("tension_offset", "friction", "motion", "discs") if name in t},
+            **{name: t[name] for name in ("tension_offset", "tension_gain", "friction", "motion", "discs") if name in t},
         )
         for t in record["tendons"]
     )

@@ -3,13 +3,11 @@
 import math
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ..analysis.calibration import Calibration
-from ..estimation.shared import BaseFrame
-from ..model.uncertainty import SHIFT, TURN, Found
+from ..model.uncertainty import SHIFT, TURN
 from .json_file import plain, put_json
 from .uncertainty import Calibrated
 
@@ -54,33 +52,25 @@ def write_calibration(path: str | Path, calibration: Calibration, samples: list[
 IN_PLACE = ("mass", "stiffness")  # whose values stand where the file has them, and tension_offset_1, ..
 
 
-def calibrated_by(found: Calibration, before: Calibrated | None, noise: float, s: Float[Tensor, " P"], offsets: bool) -> Calibrated:
-    """[calibration] of what was found about a robot that may have been calibrated before.
+def calibrated_by(found: Calibration, noise: float, s: Float[Tensor, " P"] | None) -> Calibrated:
+    """[calibration] of what was found.
 
-    noise: as stated (m); written is what the residuals show, where that is larger. s: (m), of the markers; offsets: whether they
-    are said to be off by what is left over.
+    noise: as stated (m); written is what the residuals show, where that is larger. s: (m), of the markers, where they are said to
+    be off by what is left over on average; the noise is then that about it, and of how sure it is.
     """
-    old = before or Calibrated({}, Found((), torch.zeros(0, 0)))
-    values = dict(old.values)
+    values = {}
     for unknown, z in zip(found.unknowns, found.z.tolist(), strict=True):
-        if unknown.parameter is None:
-            continue
-        name, error = unknown.parameter.name, unknown.error(z)
-        if name in IN_PLACE or name.startswith("tension_offset"):
-            values[name] = 0.0
-        elif unknown.parameter.relative:
-            values[name] = (1 + values.get(name, 0.0)) * (1 + error) - 1
-        else:
-            values[name] = values.get(name, 0.0) + error
+        if unknown.parameter is not None:
+            name = unknown.parameter.name
+            in_place = name in IN_PLACE or name.startswith("tension_offset")
+            values[name] = 0.0 if in_place else unknown.error(z)
     if found.frame is not None:
-        zeta = BaseFrame(old.zeta, torch.zeros(6, 6)).moved_by(found.frame.zeta)
-        values |= dict(zip((*SHIFT, *TURN), zeta.tolist(), strict=True))
-    kept = [i for i, name in enumerate(old.found.names) if name not in found.found.names]
-    names = (*found.found.names, *(old.found.names[i] for i in kept))
-    covariance = torch.block_diag(found.found.covariance, old.found.covariance[kept][:, kept])
-    return Calibrated(
-        {name: values[name] for name in names},
-        Found(names, covariance),
-        noise * math.sqrt(max(1.0, found.chi2 / max(found.dof, 1))),
-        found.marker_offsets(s) if offsets else old.markers,
-    )
+        values |= dict(zip((*SHIFT, *TURN), found.frame.zeta.tolist(), strict=True))
+    if s is None:
+        return Calibrated(values, found.found, noise * math.sqrt(max(1.0, found.chi2 / max(found.dof, 1))))
+    offsets = found.marker_offsets(s)
+    about = found.residual - found.residual.nanmean(0)
+    explained = float((found.residual.square() - about.square()).nansum()) / noise**2
+    excess = (found.chi2 - explained) / max(found.dof - 3 * len(offsets), 1)
+    sure = float(offsets[:, 4].square().mean())
+    return Calibrated(values, found.found, math.sqrt(noise**2 * max(1.0, excess) + sure), offsets)

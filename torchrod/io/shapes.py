@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mechanics.lie import conjugate, exponential, product, unrotate
+from ..mechanics.lie import conjugate, exponential, product, rotate, unrotate
 from ..model.sensors import BaseWrench, CentreLine, Curvature, Markers, Poses, Sensor
 from ..util.precision import DTYPE, Float64
 
@@ -81,6 +81,15 @@ class Shapes(Float64):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return sum(int(sensor.groups.max()) + 1 for sensor in self.sensors(Noises(1.0, 1.0, (1.0, 1.0), 1.0)))
+
+    def measured(self, zeta: Float[Tensor, " 6"], markers: Float[Tensor, "n 5"]) -> "Shapes":
+        """The inverse of `corrected` for positions; markers of which nothing is known are measured where they are."""
+        p = self.positions
+        if len(markers):
+            off = (self.s.unsqueeze(-1) - markers[:, 0]).abs()
+            known = (off.amin(-1) <= SAME_PLACE).unsqueeze(-1)
+            p = p + torch.where(known, markers[off.argmin(-1), 1:4], 0.0)
+        return replace(self, positions=rotate(exponential(zeta[3:]), p) + zeta[:3])
 
     @property
     def points(self) -> Float[Tensor, "B N 3"]:

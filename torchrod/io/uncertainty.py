@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..mechanics.robot import Robot
-from ..model.uncertainty import KINDS, SHIFT, TURN, Found, Uncertainty, every_parameter
+from ..model.uncertainty import KINDS, MOST_SHARE, RELATIVE, SHIFT, TURN, Found, Uncertainty, every_parameter
 from ..model.unknowns import Registration
 from ..util.errors import InputError, shown
 from ..util.precision import DTYPE
@@ -26,6 +26,7 @@ KEYS = {*KINDS, FRAME}
 OF_A_SAMPLE = {"curvature", "curvature_length", "metric"}  # another in every sample, and nothing that is calibrated
 CALIBRATION_KEYS = {"parameters", "values", "covariance", "noise", "markers"}
 LENGTHS, ANGLES = {"curvature_length", "tendon_place"}, {"gravity"}
+MOST_VALUE = 100.0  # of an error, in its SI unit: N, m, rad, 1/m
 MARKER_ROW = 5  # s, x, y, z, std
 
 
@@ -152,9 +153,21 @@ def calibrated_of(path: Path, content: dict[str, Any]) -> Calibrated | None:
         found = Found(tuple(names), torch.tensor(covariance, dtype=DTYPE).reshape(len(names), len(names)))
     except ValueError as error:
         raise InputError(f"{where}: {str(error).replace('Found.', '')}; calibrate again") from None
+    for name, value in zip(names, values, strict=True):
+        if name in TURN and abs(value) > math.pi:
+            raise InputError(f"{where}.values: {name} is {value:g} rad; it must be from -pi to pi")
+        if abs(value) > MOST_VALUE:
+            raise InputError(f"{where}.values: {name} is {value:g}; torchrod calibrate writes nothing like it, calibrate again")
+    for name, variance in zip(names, found.covariance.diagonal().tolist(), strict=True):
+        if name.split("_")[0] in RELATIVE and "offset" not in name and variance > MOST_SHARE**2:
+            raise InputError(f"{where}.covariance: {name} has a standard deviation above {MOST_SHARE:.0%}; calibrate again")
     noise = as_number(f"{where}.noise", table["noise"], positive=True) if "noise" in table else None
+    if noise is not None and not 1e-9 <= noise <= 1:
+        raise InputError(f"{where}.noise is {noise:g} m; it must be from 1e-9 to 1")
     markers = as_rows(f"{where}.markers", table["markers"], MARKER_ROW) if table.get("markers") else []
     rows = torch.tensor(markers, dtype=DTYPE).reshape(-1, MARKER_ROW)
+    if bool((rows[:, 4] < 0).any()):
+        raise InputError(f"{where}.markers: the last number of a row is a standard deviation (m), at least 0")
     return Calibrated(dict(zip(names, values, strict=True)), found, noise, rows)
 
 
@@ -174,7 +187,7 @@ def calibration_text(calibrated: Calibrated) -> str:
         "]",
     ]
     if calibrated.noise is not None:
-        lines.append(f"noise = {calibrated.noise:.6g}  # m, of a marker's coordinate, as these shapes show it")
+        lines.append(f"noise = {calibrated.noise:.6g}  # m, of a marker's coordinate: as stated, or as the residuals show")
     if len(calibrated.markers):
         lines += ["markers = [  # s, by how much the marker there is measured off (x, y, z), standard deviation; m"]
         lines += [*(f"  {numbers(row)}," for row in calibrated.markers.tolist()), "]"]

@@ -98,7 +98,7 @@ def solve_displacement(
     if len(robot.tendons) != T or not T:
         raise ValueError(f"{T} displacements for {len(robot.tendons)} tendons; give one per tendon")
     # The load cells' offsets belong to readings; here the unknowns are the tensions themselves.
-    robot = replace(robot, tendons=Tendons(tuple(replace(t, tension_offset=0.0) for t in robot.tendons.tendons)))
+    robot = replace(robot, tendons=Tendons(tuple(replace(t, tension_offset=0.0, tension_gain=1.0) for t in robot.tendons.tendons)))
     n = steps or steps_for(replace(robot, gravity=torch.zeros(3, dtype=torch.float64)), outputs)
     answer = _pulled(robot, loads, displacement, outputs, n)
     if steps is not None:

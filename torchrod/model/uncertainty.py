@@ -285,7 +285,9 @@ def _gravity(k: int) -> Change:
 
     def change(robot: Robot, error: float) -> Robot:
         g = robot.gravity
-        least = torch.nn.functional.one_hot(g.abs().argmin(-1), 3).to(g.dtype)
+        # Of sizes to a half of the largest, so that a small turn does not choose another axis.
+        coarse = (2 * g.abs() / g.abs().amax(-1, keepdim=True)).round()
+        least = torch.nn.functional.one_hot(coarse.argmin(-1), 3).to(g.dtype)
         first = torch.linalg.cross(g, least)
         first = first * (g.norm(dim=-1, keepdim=True) / first.norm(dim=-1, keepdim=True))
         across = first if k == 0 else torch.linalg.cross(g, first) / g.norm(dim=-1, keepdim=True)
