@@ -28,7 +28,7 @@ from torchrod import (
     write_shapes,
 )
 from torchrod.cli import main
-from torchrod.io import read_uncertainty
+from torchrod.io import read_fit, read_uncertainty
 from torchrod.mechanics.lie import rotate
 from torchrod.util.status import Status
 
@@ -563,3 +563,36 @@ def test_bad_keys_are_one_line(tmp_path, capsys, monkeypatch, text, options, wor
     captured = capsys.readouterr()
     assert words in captured.err, captured.err
     assert captured.err.count("\n") == 1, captured.err
+
+
+def test_results_of_a_calibrated_robot_in_space_and_in_a_figure(tmp_path, capsys):
+    """[base] and the calibrated frame make one pose; the line that is drawn has the parameters that were found."""
+    text = STATED[: STATED.index("[uncertainty]")] + "[base]\nposition = [1.0, 0.0, 0.0]\n\n[uncertainty]\nset = 0.5\n"
+    table = '[calibration]\nparameters = ["frame_x"]\nvalues = [0.02]\ncovariance = [[1e-10]]\nnoise = 2e-4\n'
+    robot, shapes = tmp_path / "r.toml", tmp_path / "s.csv"
+    robot.write_text(text + table)
+    plain = read_robot(robot)
+    rows = plain.rod.reference_curvature + T([[0.0, 0.4, -0.3, 0.0]])
+    bent = replace(plain, rod=replace(plain.rod, reference_curvature=rows))
+    s, push = torch.linspace(0.05, 0.4, 8), PointForces(T([[[0.5, 0.0, 0.0]]]), T([[0.3]]))
+    solved = solve_shape(bent, (push,), T([[2.0]]), T([*s.tolist(), 0.3]).sort().values, 1, 40).p[0]
+    at = torch.isin(T([*s.tolist(), 0.3]).sort().values, s)
+    write_shapes(shapes, Shapes(s, (solved[at] + T([0.02, 0.0, 0.0]))[None], ["a"], None, T([[2.0]])))
+    for suffix in ("json", "npz"):
+        result, figure = tmp_path / f"r.{suffix}", tmp_path / f"{suffix}.png"
+        assert main(["estimate", str(robot), str(shapes), "--load-prior", "point", "--out", str(result)]) == 0
+        assert main(["plot", str(robot), str(shapes), str(result), "--out", str(figure)]) == 0
+        fit = read_fit(result, "a")
+        nearly = read_uncertainty(robot).of_a_sample
+        assert nearly is not None
+        assert fit.errors["set_x"] == pytest.approx(0.4, abs=0.05)
+        assert fit.errors["set_y"] == pytest.approx(-0.3, abs=0.05)
+        found, warp = nearly.found_at(plain, fit.errors)
+        line = shape_from_base(found, fit.loads(0.4), fit.base_wrench[None], T([[2.0]]), s, 40).p[0]
+        assert float((line - warp.undone(solved[at])).norm(dim=-1).max()) < 1e-3
+        assert (
+            float((shape_from_base(plain, fit.loads(0.4), fit.base_wrench[None], T([[2.0]]), s, 40).p[0] - line).abs().max()) > 5e-3
+        )
+    load = json.loads((tmp_path / "r.json").read_text())["results"][0]["loads"][0]
+    assert load["position_lab_m"] == pytest.approx([a + b for a, b in zip(load["position_m"], (1.02, 0, 0), strict=True)], abs=1e-6)
+    capsys.readouterr()

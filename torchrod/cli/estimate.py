@@ -186,7 +186,9 @@ def estimate(options: Namespace) -> None:
         said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
         nearly = problem.unknowns.uncertainty
         said["parameters"] = [] if nearly is None else [p.name for p in nearly.parameters(robot)]
-        said |= {"profile": _profile(options, found), "base": read_base_pose(options.robot), "time": shapes.time}
+        base = read_base_pose(options.robot)
+        base = base if base is None or calibrated is None else base.moved(calibrated.zeta)
+        said |= {"profile": _profile(options, found), "base": base, "time": shapes.time}
         write_result(options.out, fit, shapes.samples, robot.name, **said)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
@@ -235,4 +237,9 @@ def _draw(path: str, robot: Robot, shapes: Shapes, found: Analysis) -> None:
     b = drawable[0]
     title = f"{robot.name}, sample {shapes.samples[b]}: {fit.message(b)}"
     tension = None if shapes.tension is None else shapes.tension[b]
-    draw(path, robot, fit.fitted_rod(b, found.profile), shapes.points[b], tension, title)
+    rod, points, nearly = fit.fitted_rod(b, found.profile), shapes.points[b], found.problem.unknowns.uncertainty
+    if nearly is not None and fit.parameters is not None:
+        names = [p.name for p in nearly.parameters(robot)]
+        robot, warp = nearly.found_at(robot, dict(zip(names, fit.parameters[b].tolist(), strict=True)))
+        points = warp.undone(points)
+    draw(path, robot, rod, points, tension, title)

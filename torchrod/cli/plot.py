@@ -13,7 +13,8 @@ def plot(options: Namespace) -> None:
 
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot, options.units, options.tensions)
-    shapes = as_calibrated(options.shapes, shapes, read_uncertainty(options.robot).calibrated)
+    known = read_uncertainty(options.robot)
+    shapes = as_calibrated(options.shapes, shapes, known.calibrated)
     sample = shapes.samples[0] if options.sample is None else options.sample
     if sample not in shapes.samples:
         raise InputError(f"{options.shapes}: has no sample {sample}; choose one of its samples with --sample")
@@ -21,4 +22,8 @@ def plot(options: Namespace) -> None:
     fit = read_fit(options.result, sample, robot.name, shapes.groups, robot.rod.length)
     b = shapes.samples.index(sample)
     tension = None if shapes.tension is None else shapes.tension[b]
-    draw(options.out, robot, fit, shapes.points[b], tension, f"{robot.name}, sample {sample}")
+    points, nearly = shapes.points[b], known.of_a_sample
+    if nearly is not None and fit.errors:
+        robot, warp = nearly.found_at(robot, fit.errors)
+        points = warp.undone(points)
+    draw(options.out, robot, fit, points, tension, f"{robot.name}, sample {sample}")

@@ -1,8 +1,8 @@
 """The result of an estimate: loads, how sure, how well they explain the readings, and what became of every sample."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 
 import torch
@@ -32,7 +32,7 @@ class FittedRod:
     wrench (6,) [N, N m], the registration (6,) [m, rad] that carries the rod into the measured frame, or None, the unknown
     force (3,) N at the tip in the base frame, or None, the 95 % intervals (K, 2) m of the locations, NaN where they are not
     known, and the load profile with its band; both None where only the shape is to be drawn. axial (K,) N: the forces along the
-    rod, or None.
+    rod, or None. errors: of the robot's parameters, by their names (model.uncertainty).
     """
 
     force: Float[Tensor, "K 2"]
@@ -44,6 +44,7 @@ class FittedRod:
     location_interval: Float[Tensor, "K 2"] | None = None
     profile: Profile | None = None
     axial: Float[Tensor, " K"] | None = None
+    errors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def pushes(self) -> Float[Tensor, "K 3"]:

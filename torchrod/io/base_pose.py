@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mechanics.lie import exponential, rotate
+from ..mechanics.lie import exponential, product, rotate
 from ..util.errors import InputError, shown
 from ..util.precision import DTYPE, Float64
 from .values import as_numbers, as_table
@@ -25,6 +25,10 @@ class BasePose(Float64):
     def to_lab(self, p: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
         """Points (m) of the base frame in the lab's."""
         return self.turned(p) + self.position
+
+    def moved(self, zeta: Float[Tensor, " 6"]) -> "BasePose":
+        """Of a base that is off by zeta (m, rad) in the frame of this one."""
+        return BasePose(self.to_lab(zeta[:3]), product(self.rotation, exponential(zeta[3:])))
 
     def turned(self, v: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
         """Vectors of the base frame in the lab's."""

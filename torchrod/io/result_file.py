@@ -329,6 +329,8 @@ def write_result(
     place = {text: i for i, text in enumerate(sorted(set(texts)))}
     names = {"sample": np.array(samples), "robot": np.array(robot), "messages": np.array(list(place))}
     names["message"] = np.array([place[text] for text in texts])
+    if parameters:
+        names["parameter_names"] = np.array(list(parameters))
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
@@ -403,6 +405,9 @@ def _arrays_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]
         values["tip"] = _there(file["tip"][b][:3].tolist()) if "tip" in file else None
         values["interval"] = file["location_interval"][b] if "location_interval" in file else None
         values["axial"] = file["axial"][b] if "axial" in file else None
+        if "parameter_names" in file and "parameters" in file:
+            names = [str(name) for name in file["parameter_names"]]
+            values["errors"] = dict(zip(names, file["parameters"][b].tolist(), strict=True))
         if "profile_f" not in file:
             return values, None
         return values, {"s": file["profile_s"], "f": file["profile_f"][b], "band": file["profile_band"][b]}
@@ -423,6 +428,7 @@ def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]
     values["tip"] = _there(record["tip"]["force_N"]) if "tip" in record else None
     values["interval"] = [load["interval_95"]["location_m"] for load in loads]
     values["axial"] = [load["force_axial_N"] for load in loads] if any("force_axial_N" in load for load in loads) else None
+    values["errors"] = {name: p["error"] for name, p in record["parameters"].items()} if "parameters" in record else {}
     profile = record.get("profile")
     if profile is None:
         return values, None
@@ -457,7 +463,8 @@ def _fit_of(values: Values, stored: Values | None) -> FittedRod:
         profile = Profile(s, f, band)
     there = torch.isfinite(force).all(-1)
     interval, axial = (None if value is None else value[there] for value in (interval, axial))
-    return FittedRod(force[there], location[there], width[there], wrench, zeta, tip, interval, profile, axial)
+    errors = {str(name): float(error) for name, error in dict(values.get("errors") or {}).items()}  # pyright: ignore
+    return FittedRod(force[there], location[there], width[there], wrench, zeta, tip, interval, profile, axial, errors)
 
 
 def read_fit(
@@ -486,6 +493,7 @@ def _read_fit(asked: _Asked, opened: IO[bytes]) -> FittedRod:
     except UNREADABLE as error:
         raise InputError(f"{asked.path}: is not a result of torchrod estimate ({why(error)}); write it with --out") from None
     numbers = [fit.force, fit.location, fit.width, fit.base_wrench, fit.registration, fit.tip_force, fit.axial]
+    numbers.append(torch.tensor([*fit.errors.values(), 0.0]))
     if not all(bool(torch.isfinite(t).all()) for t in numbers if t is not None) or bool((fit.width < 0).any()):
         raise InputError(f"{asked.path}: sample {asked.sample} has no fit to draw; see its message")
     asked.check_places(fit)

@@ -11,7 +11,7 @@ moves all of them along a column of a root of their covariance.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -84,6 +84,10 @@ class Warp(Float64):
     def __call__(self, p: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
         """Measured, of where they are."""
         return p @ self.matrix.mT + self.shift
+
+    def undone(self, p: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+        """Where they are, of what was measured."""
+        return torch.linalg.solve(self.matrix, (p - self.shift).unsqueeze(-1)).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -186,6 +190,13 @@ class Uncertainty:
                     off = parameter.change(off, sign * error) if error and parameter.change is not None else off
                 found.append((off, Warp.of(seen) if seen else None))
         return found
+
+    def found_at(self, robot: Robot, errors: Mapping[str, float]) -> tuple[Robot, Warp]:
+        """The robot with errors by their names, as a fit has found them, and how it is measured; names of others are left aside."""
+        for parameter in self.parameters(robot):
+            error = errors.get(parameter.name, 0.0)
+            robot = parameter.change(robot, error) if error and parameter.change is not None else robot
+        return robot, Warp.of(dict(errors))
 
     def _of(self, robot: Robot, std: dict[str, float]) -> list[Parameter]:
         """All that a robot has, with these standard deviations of their kinds."""
