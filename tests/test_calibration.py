@@ -596,3 +596,20 @@ def test_results_of_a_calibrated_robot_in_space_and_in_a_figure(tmp_path, capsys
     load = json.loads((tmp_path / "r.json").read_text())["results"][0]["loads"][0]
     assert load["position_lab_m"] == pytest.approx([a + b for a, b in zip(load["position_m"], (1.02, 0, 0), strict=True)], abs=1e-6)
     capsys.readouterr()
+
+
+@pytest.mark.many_fits
+@pytest.mark.parametrize("weight", [4.0, 12.0])
+def test_a_rod_that_stands_is_not_taken_for_one_that_has_fallen(weight):
+    """An upright rod, leaning a little, of w L^3 / EI = 4 (it stands) and 12 (it has fallen), from a fifth and four times that."""
+    rod = Rod.circular(0.4, 0.0014, 207e9, 79e9)
+    mass = weight * rod.bending_stiffness / 0.4**3 / 9.81
+    up = T([0.05, 0.0, -1.0]) * 9.81
+    s = torch.linspace(0.05, 0.4, 8)
+    truth = Robot(replace(rod, mass_per_length=T(mass)), gravity=up)
+    p = solve_shape(truth, (), None, s, 1).p
+    markers = Markers(s, p + NOISE * torch.randn(p.shape, generator=torch.Generator().manual_seed(0)), NOISE)
+    for factor in (0.2, 4.0):
+        found = calibrate(Robot(replace(rod, mass_per_length=T(factor * mass)), gravity=up), markers)
+        assert found.accepted, factor
+        assert abs(float(found.values[0]) - mass) < 4 * float(found.std[0])

@@ -33,6 +33,8 @@ from ..util.precision import DTYPE
 from ..util.status import Status
 
 INNER = 100  # iterations of each fit; the settings' own count is of the steps of the parameters
+OTHER_MASSES = (0.25, 4.0, 0.06, 16.0)  # of the first, to start from
+WRONG = 10.0  # of the readings: a cost that no noise makes
 FREE = 10.0  # standard deviation of what is free, in sizes: it only keeps what does not show finite
 SOUGHT = tuple(kind for kind in KINDS if kind not in ("curvature", "curvature_length", "metric"))  # the same in all samples
 FIRST_SAG = 0.05  # where the file has no mass: the tip of the straight rod, held across gravity, sags by this part of its length
@@ -237,7 +239,27 @@ def calibrate(
             f"{error} at {float(start.rod.mass_per_length):.3g} kg/m; check the units of tensions and stiffness, or start from "
             "another mass_per_length"
         ) from None
+    found = _from_other_masses(found, parts, terms, settings, names=[u.name for u in sought])
     return _result(whole, sought, found, [index for _, index in groups], robot)
+
+
+def _from_other_masses(found: Joint, parts: list[Problem], terms: list[Shared], settings: Settings, names: list[str]) -> Joint:
+    """The fit of least cost of those from other masses, where the first is plainly wrong: a rod that has fallen over under too much
+    weight, or stands under too little, is no way from one shape to the other.
+    """
+    seen = sum(int(part.seen.sum()) for part in parts)
+    for factor in OTHER_MASSES if MASS in names else ():
+        if found.cost < WRONG * seen:
+            break
+        start = torch.zeros_like(found.z)
+        start[names.index(MASS)] = math.log(factor)
+        try:
+            other = fit_jointly(parts, terms, replace(settings, max_iterations=INNER), settings.max_iterations, start)
+        except ValueError:  # no equilibrium at all under it
+            continue
+        if other.count >= found.count and other.cost < found.cost:
+            found = other
+    return found
 
 
 def _with_mass(robot: Robot) -> Robot:

@@ -94,6 +94,11 @@ class Joint:
     iterations: int
     status: Status
 
+    @property
+    def count(self) -> int:
+        """How many samples had a say."""
+        return sum(int(some.sum()) for some in self.used)
+
     def covariance(self, excess: float = 1.0) -> Float[Tensor, "k k"]:
         """(P + sum S / excess)^-1: with the stated variances of the sensors multiplied by `excess`."""
         A = self.prior + self.information / excess
