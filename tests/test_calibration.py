@@ -28,6 +28,7 @@ from torchrod import (
     write_shapes,
 )
 from torchrod.cli import main
+from torchrod.estimation.joint import Shared, fit_jointly
 from torchrod.io import read_fit, read_uncertainty
 from torchrod.mechanics.lie import rotate
 from torchrod.util.status import Status
@@ -613,3 +614,20 @@ def test_a_rod_that_stands_is_not_taken_for_one_that_has_fallen(weight):
         found = calibrate(Robot(replace(rod, mass_per_length=T(factor * mass)), gravity=up), markers)
         assert found.accepted, factor
         assert abs(float(found.values[0]) - mass) < 4 * float(found.std[0])
+
+
+def test_a_step_too_far_is_halved():
+    """A parameter z with log k = z / 10 + 8 z^3: the first step, as long as it may be, is 3,000 times too stiff."""
+    rod, s = Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), torch.linspace(0.05, 0.4, 8)
+
+    def stiffer(robot: Robot, k: float) -> Robot:
+        return replace(robot, rod=replace(robot.rod, K_se=k * robot.rod.K_se, K_bt=k * robot.rod.K_bt))
+
+    def change(problem: Problem, z: torch.Tensor) -> Problem:
+        return replace(problem, robot=stiffer(problem.robot, math.exp(float(0.1 * z + 8 * z**3))))
+
+    robot = Robot(rod, gravity=SIDEWAYS)
+    p = solve_shape(stiffer(robot, 1.5), (), None, s, 1, 40).p
+    found = fit_jointly([Problem(robot, unknowns_of(robot, 0), [Markers(s, p, NOISE)])], [Shared((1.0,), (10.0,), change)])
+    assert found.status is Status.CONVERGED
+    assert float(0.1 * found.z + 8 * found.z**3) == pytest.approx(math.log(1.5), rel=1e-2)
