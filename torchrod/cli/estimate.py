@@ -14,7 +14,17 @@ from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_o
 from ..estimation.load_profile import Profile
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
-from ..io import RESULT_SUFFIXES, Noises, Shapes, read_base_pose, read_robot, read_shapes, read_uncertainty, write_result
+from ..io import (
+    RESULT_SUFFIXES,
+    NearlyKnown,
+    Noises,
+    Shapes,
+    read_base_pose,
+    read_robot,
+    read_shapes,
+    read_uncertainty,
+    write_result,
+)
 from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
@@ -29,8 +39,8 @@ from .table import table
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
 ANGLE_NOISE = 0.01  # rad
 EXACT = (
-    "The robot is taken as exact: tensions, friction, stiffness, base frame. What is only nearly known passes for a load; "
-    "state it under [uncertainty] of ROBOT.toml, or calibrate it."
+    "The robot is taken as exact, its tensions, friction and stiffness too. What is only nearly known passes for a load; state it "
+    "under [uncertainty] of ROBOT.toml, or calibrate it."
 )
 NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
@@ -124,12 +134,11 @@ def _check_enough(options: Namespace, problem: Problem) -> None:
     )
 
 
-def _problem(options: Namespace, robot: Robot, shapes: Shapes, noise: float | None) -> Problem:
+def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shapes, noise: float | None) -> Problem:
     """The readings, with one load among the unknowns, whose number and width the hypotheses replace."""
     rod = robot.rod
     std = options.tension_std if len(robot.tendons) else None
     loads = GaussianCoordinates(1, rod.length, rod.force_scale)
-    nearly = read_uncertainty(options.robot)
     registration = _registration(options) or nearly.frame_of_a_sample
     stated = STATED * rod.length if noise is None else noise
     angle = ANGLE_NOISE if options.angle_noise is None else options.angle_noise
@@ -156,7 +165,8 @@ def estimate(options: Namespace) -> None:
     """torchrod estimate."""
     robot = read_robot(options.robot)
     shapes = read_shapes(options.shapes, robot, options.units, options.tensions)
-    calibrated = read_uncertainty(options.robot).calibrated
+    known = read_uncertainty(options.robot)
+    calibrated = known.calibrated
     shapes = as_calibrated(options.shapes, shapes, calibrated)
     usual = calibrated.noise if calibrated is not None else None
     noise = usual or NOISE if options.noise is None else noise_or_auto(options.noise, robot.rod.length)
@@ -166,7 +176,7 @@ def estimate(options: Namespace) -> None:
     writable(options.out, RESULT_SUFFIXES)
     writable(options.plot, FIGURE_SUFFIXES)
     _warn_of_idle(options, robot, shapes)
-    problem = _problem(options, robot, shapes, noise)
+    problem = _problem(options, robot, known, shapes, noise)
     count, at = _count(options, robot), options.location or None
     candidates = contact_hypotheses(problem, count, options.load_prior, at, _friction(options))
     _check_enough(options, problem.of(next((c for c in candidates if c.contacts), candidates[0]).unknowns))
