@@ -544,6 +544,11 @@ def test_a_known_weight_tells_the_stiffness(tmp_path, capsys):
         (STATED.replace("friction = 0.2", "fricton = 0.2"), [], "uncertainty.shared: unknown key 'fricton'"),
         (STATED.replace("friction = 0.2", "friction = -0.2"), [], "uncertainty.shared: friction is -0.2"),
         (STATED.replace("friction = 0.2", "curvature = 0.2"), [], "uncertainty.shared: unknown key 'curvature'"),
+        (
+            STATED.replace("tension = 0.1", "stiffness = 0.4").replace("friction = 0.2", "stiffness = 0.4"),
+            [],
+            "uncertainty: together with shared, stiffness is 0.56",
+        ),
         (STATED, ["--free", "frition"], "frition is nothing that is calibrated; it must be one of"),
         (STATED, ["--contacts", "-1"], "--contacts is -1"),
         (STATED + '[calibration]\nparameters = ["friction_1"]\nvalues = []\ncovariance = [[1]]\n', [], "calibration.values"),

@@ -34,8 +34,8 @@ MARKER_ROW = 5  # s, x, y, z, std
 class Calibrated:
     """[calibration]: errors of parameters about what the file says, and what is left unknown of them.
 
-    values: by name, in SI units. found: their covariance. noise: m, of a coordinate, as the unloaded shapes show it; None where it
-    is not said. markers: rows [s, x, y, z, std] (m), by how much the marker at s is measured off, base frame.
+    values: by name, in SI units. found: their covariance. noise: m, of a coordinate, as it was stated or as the residuals show;
+    None where it is not said. markers: rows [s, x, y, z, std] (m), by how much the marker at s is measured off, base frame.
     """
 
     values: dict[str, float]
@@ -65,8 +65,8 @@ class Calibrated:
 class NearlyKnown:
     """What a file says of it; None where it says nothing.
 
-    own, frame: what is another in every sample. shared, shared_frame: what is not known, but the same in all. found: what a
-    calibration has left unknown, which takes the place of what was shared.
+    own, frame: what is another in every sample. shared, shared_frame: what is not known, but the same in all. calibrated: what a
+    calibration has found, and left unknown, which takes the place of what was shared.
     """
 
     own: Uncertainty | None = None
@@ -116,7 +116,12 @@ def uncertainty_of(path: Path, content: dict[str, Any]) -> NearlyKnown:
     table = as_table(where, in_si(where, content["uncertainty"], LENGTHS, ANGLES), KEYS | {SHARED})
     own = _stated(where, {key: value for key, value in table.items() if key != SHARED})
     shared = _stated(f"{where}.{SHARED}", table[SHARED], KEYS - OF_A_SAMPLE) if SHARED in table else (None, None)
-    return NearlyKnown(*own, *shared, calibrated)
+    nearly = NearlyKnown(*own, *shared, calibrated)
+    try:
+        _ = nearly.of_a_sample
+    except ValueError as error:
+        raise InputError(f"{where}: together with {SHARED}, {str(error).removeprefix('Uncertainty.')}") from None
+    return nearly
 
 
 def _stated(where: str, content: object, known: set[str] = KEYS) -> tuple[Uncertainty | None, Registration | None]:
