@@ -44,21 +44,26 @@ struct Balance {
     V x[6], inverse[36], g[MOST_TENDONS * 6];
 };
 
+// What the strains x leave of the section's wrench w, and minus its derivative, without the tendons' share.
+INLINE void without_tendons(const Stiffness& K, const V* star, const V* x, const V* w, V* misfit, V* J) {
+    for (int i = 0; i < 36; i++) J[i] = V{};
+    for (int i = 0; i < 3; i++) {
+        misfit[i] = w[i], misfit[3 + i] = w[3 + i];
+        for (int j = 0; j < 3; j++) {
+            misfit[i] -= K.se[3 * i + j] * (x[j] - star[j]);
+            misfit[3 + i] -= K.bt[3 * i + j] * (x[3 + j] - star[3 + j]);
+            J[6 * i + j] = K.se[3 * i + j], J[6 * (3 + i) + 3 + j] = K.bt[3 * i + j];
+        }
+    }
+}
+
 // tendons.py, balanced_strains: the values.
 inline void balance(const Known& m, const Stiffness& K, const Stage& at, const V* tau, const V* w, Balance& b) {
     const V star[6] = {V{}, V{}, splat(1.0), at.u_star.c[0], at.u_star.c[1], at.u_star.c[2]};
     for (int i = 0; i < 6; i++) b.x[i] = star[i];
     for (int iteration = 0; iteration <= m.newton; iteration++) {
         V misfit[6], J[36];
-        for (int i = 0; i < 36; i++) J[i] = V{};
-        for (int i = 0; i < 3; i++) {
-            misfit[i] = w[i], misfit[3 + i] = w[3 + i];
-            for (int j = 0; j < 3; j++) {
-                misfit[i] -= K.se[3 * i + j] * (b.x[j] - star[j]);
-                misfit[3 + i] -= K.bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
-                J[6 * i + j] = K.se[3 * i + j], J[6 * (3 + i) + 3 + j] = K.bt[3 * i + j];
-            }
-        }
+        without_tendons(K, star, b.x, w, misfit, J);
         for (int64_t t = 0; t < m.tendons; t++) {
             const V* L = at.L + 18 * t;
             V along[3], *g = b.g + 6 * t, square = V{};
@@ -136,15 +141,7 @@ inline void balance_chords(const Known& m, const Stiffness& K, const Stage& at, 
     for (int i = 0; i < 6; i++) b.x[i] = star[i];
     for (int iteration = 0; iteration <= m.newton; iteration++) {
         V misfit[6], J[36], dg[36], step[6];
-        for (int i = 0; i < 36; i++) J[i] = V{};
-        for (int i = 0; i < 3; i++) {
-            misfit[i] = w[i], misfit[3 + i] = w[3 + i];
-            for (int j = 0; j < 3; j++) {
-                misfit[i] -= K.se[3 * i + j] * (b.x[j] - star[j]);
-                misfit[3 + i] -= K.bt[3 * i + j] * (b.x[3 + j] - star[3 + j]);
-                J[6 * i + j] = K.se[3 * i + j], J[6 * (3 + i) + 3 + j] = K.bt[3 * i + j];
-            }
-        }
+        without_tendons(K, star, b.x, w, misfit, J);
         const bool last = iteration == m.newton;
         for (int64_t t = 0; t < m.tendons; t++) {
             V* g = b.g + 6 * t;
