@@ -96,7 +96,7 @@ def other_solutions(
 
     Only of samples that were read at few places, and that are accepted. parts: the unknowns of each sample, as in Analysis.
     """
-    settings = replace(settings or Settings(), restarts=(), basins=0)
+    settings = replace(settings or Settings(), restarts=(), basins=0, sized=False)
     found: list[tuple[Solution, ...]] = [()] * problem.batch
     few = read_at_few_places(problem) & fit.accepted
     for unknowns, index in parts:

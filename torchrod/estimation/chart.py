@@ -17,9 +17,10 @@ anywhere along the rod with the same probability, and of any size,
 
     (2)  p(eta) = r (1 - r),    p(F) = exp(-|F|^2 / 2 w^2) / (f^2 + |F|^2)^(d/2) / Z
 
-even in log |F| between the least force worth telling (f = FAINT) and the fit's own weak prior (w), in d dimensions; the unknown
-force and moment at the tip alike. Widths, tensions and the base frame's error keep their priors, and so does all that a problem
-has a prior of its own for.
+even in log |F| between the least force worth telling (f = FAINT) and the fit's own weak prior (w), F being the d components of all
+loads together: normal forces whose common size may be any. Of loads one by one, the prior would take one of two close pushes to be
+next to nothing. The unknown force and the moment at the tip have (2) each for itself. Widths, tensions and the base frame's error
+keep their priors, and so does all that a problem has a prior of its own for.
 """
 
 import math
@@ -315,17 +316,16 @@ class Chart:
         return ((self.to(y.unsqueeze(1) + step) - self.to(y.unsqueeze(1) - step)) / (2 * STEP)).mT
 
     @cached_property
-    def _scale_free(self) -> list[tuple[slice, float]]:
-        """The entries that are a force or a moment of any size, each with the deviation of its weak prior."""
+    def _scale_free(self) -> list[tuple[list[int], float]]:
+        """The entries that are forces or moments of any size, by which size they share, each with its weak prior's deviation."""
         loads, found = self.problem.unknowns.loads, []
         if self.problem.prior is not None:
             return found
-        if isinstance(loads, GaussianCoordinates | PointCoordinates) and loads.force_std == WEAK_STD:
-            found += [(slice(loads.per_load * k, loads.per_load * k + 2), WEAK_STD) for k in range(loads.count)]
-            if loads.friction == math.inf:
-                found += [(slice(i, i + 1), WEAK_STD) for i in self.along]
+        if isinstance(loads, GaussianCoordinates | PointCoordinates) and loads.force_std == WEAK_STD and loads.count:
+            lateral = [loads.per_load * k + i for k in range(loads.count) for i in range(2)]
+            found.append((lateral + (self.along if loads.friction == math.inf else []), WEAK_STD))
         tip = self.problem.state.tip.at
-        return found + [(slice(first, first + 3), TIP_STD) for first in range(tip.start, tip.stop, 3)]
+        return found + [(list(range(first, first + 3)), TIP_STD) for first in range(tip.start, tip.stop, 3)]
 
     def fitted_prior(self, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"]:
         """What the fit's cost holds of its own prior."""

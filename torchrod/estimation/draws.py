@@ -31,7 +31,7 @@ from ..util.precision import DTYPE
 from ..util.status import Status
 from ..util.threads import one_thread
 from . import filter as ekf
-from .chart import Chart
+from .chart import FAINT, Chart
 from .evaluator import Evaluator, KernelEvaluator, evaluator
 from .pareto import GOOD, effective_size, smoothed
 from .result import Estimate
@@ -43,6 +43,9 @@ WIDEST = 2.5  # of eta: a place that may be anywhere has 1.8
 STRAIGHT = 0.5  # of eta: what goes with a place less sure than that, to first order, goes astray
 CELLS = {1: 96, 2: 48, 3: 24}  # along the rod, of the histogram of so many places
 ANYWHERE, FLATTER = 0.1, 0.9  # the share of the histogram that is even, and its power of what is promised
+SURELY = 5.0  # standard deviations
+LEAST_SIZE = 1.5 * FAINT  # of forces and moments at the tip
+SMALLER = (0.0, 0.5)  # of the way, in logarithms, from there to the fit's
 FARTHEST = 4.0  # |eta| of the proposal's centre
 ENOUGH = 0.1  # of the draws: a smaller effective size asks for another round
 PLENTY = 0.3  # with so many, a k-hat up to 1 will do
@@ -454,16 +457,22 @@ def _tempered(target: _Target, index: Int[Tensor, " c"], q: _Proposal, count: in
 
 
 def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple["_Proposal | _OnGrid", int]]:
-    """The first proposals: the fit's covariance in the coordinates of the chart and, for some of the draws, places anywhere."""
+    """The first proposals: the fit's covariance in the coordinates of the chart and, for some of the draws, places anywhere, and
+    less at the tip.
+    """
     chart, m = target.chart, target.chart.size
     y = target.x[:, :m].clone()
     for i in chart.places:
         y[:, i] = y[:, i].clamp(-FARTHEST, FARTHEST)
     near = chart.to(y.unsqueeze(1)).squeeze(1)
     J, K = chart.slope(y), len(chart.places)
-    C = J @ C[:, :m, :m] @ J.mT
+    C_y = C[:, :m, :m]
+    C = J @ C_y @ J.mT
+    less = [
+        _Proposal.of(chart.to(centre.unsqueeze(1)).squeeze(1), J @ own @ J.mT) for centre, own in _less_at_the_tip(target, y, C_y)
+    ]
     if chart.response is None:
-        return [(_Proposal.of(near, C), count)]
+        return _sharing([_Proposal.of(near, C)], less, count)
     at, others = torch.tensor(chart.places), torch.tensor([i for i in range(m) if i not in chart.places])
     C_at, C_both = C[:, at][:, :, at], C[:, others][:, :, at]
     follow = ekf.solve_spd(C_at, C_both.mT).mT.nan_to_num(0.0)
@@ -478,7 +487,7 @@ def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple
     whole[:, others.unsqueeze(-1), others] = C_rest + follow @ C_at @ follow.mT
     local = _Proposal.of(near, whole)
     if K not in CELLS:
-        return [(local, count)]
+        return _sharing([local], less, count)
     cell, _ = _combinations(CELLS[K], K)
     eta = torch.logit((cell.to(DTYPE) + 0.5) / CELLS[K])
     order = chart.in_order
@@ -489,7 +498,37 @@ def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple
     centre = near[:, others].clone()
     centre[:, [i for i, k in enumerate(others.tolist()) if k in chart.linear.tolist()]] = 0.0
     grid = _OnGrid(_Proposal.of(centre, C_rest), order, others, CELLS[K], share)
-    return [(local, count // 2), (grid, count - count // 2)]
+    return _sharing([local, grid], less, count)
+
+
+def _sharing(first: list["_Proposal | _OnGrid"], less: list[_Proposal], count: int) -> list[tuple["_Proposal | _OnGrid", int]]:
+    """Half of the draws to those that are there always, where there are others."""
+    main = count // 2 if less else count
+    shared = [(p, main // len(first)) for p in first] + [(p, (count - main) // len(less)) for p in less]
+    left = count - sum(k for _, k in shared)
+    return [(shared[0][0], shared[0][1] + left), *shared[1:]]
+
+
+def _less_at_the_tip(
+    target: _Target, y: Float[Tensor, "b m"], C: Float[Tensor, "b m m"]
+) -> list[tuple[Float[Tensor, "b m"], Float[Tensor, "b m m"]]]:
+    """Centre and covariance of y where the force at the tip, or the moment, is of a given small size.
+
+    The prior (2) of estimation.chart is a mixture of normal ones over their size, and so is the posterior; the fit has the widest
+    alone. Of a sample whose force, or moment, is surely not small, the fit's own.
+    """
+    found, tip = [], target.problem.state.tip.at
+    for first in range(tip.start, tip.stop, 3):
+        at = slice(first, first + 3)
+        block, own = y[:, at], C[:, at, at]
+        small = (block * ekf.solve_spd(own, block.unsqueeze(-1)).squeeze(-1)).sum(-1) < SURELY**2
+        size = (block.square().sum(-1) + own.diagonal(dim1=-2, dim2=-1).sum(-1)).div(3).sqrt()
+        for share in SMALLER:
+            sigma = LEAST_SIZE * (size / LEAST_SIZE).clamp(min=1.0) ** share
+            gain = ekf.solve_spd(own + torch.diag_embed(sigma.square().unsqueeze(-1).expand(-1, 3)), C[:, at]).mT
+            gain = torch.where(small[:, None, None], gain, 0.0)
+            found.append((y - (gain @ block.unsqueeze(-1)).squeeze(-1), C - gain @ C[:, at]))
+    return found
 
 
 def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu: float = math.inf) -> Draws:

@@ -384,6 +384,29 @@ def _read_only(problem: Problem) -> Callable[[Tensor], Tensor]:
     return _only(problem.distances((problem.weights > 0).to(DTYPE)).abs().amax(-1) > 0)
 
 
+def _spreads(
+    problem: Problem, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"]
+) -> dict[str, Float[Tensor, "B ..."] | None]:
+    """The covariance, and every field of Estimate that is a spread made of it."""
+    state, family, gamma = problem.state, problem.unknowns.loads, x[:, problem.state.loads.at]
+    tip, of_loads = state.tip.size, covariance[:, state.loads.at, state.loads.at]
+    of_tensions, of_parameters = (b.covariance(covariance).diagonal(dim1=-2, dim2=-1) for b in (state.tension, state.parameters))
+    pad = torch.nn.functional.pad
+    return {
+        "covariance": covariance,
+        "load_covariance": load_covariance(family, gamma, of_loads),
+        "axial_std": axial_std(family, gamma, of_loads),
+        "tip_covariance": pad(state.tip.covariance(covariance), (0, 6 - tip, 0, 6 - tip)) if tip else None,
+        "tension_std": of_tensions.clamp(min=0).sqrt() if state.tension.size else None,
+        "parameters_std": of_parameters.clamp(min=0).sqrt() if state.parameters.size else None,
+    }
+
+
+def with_covariance(problem: Problem, fit: Estimate, covariance: Float[Tensor, "B n n"]) -> Estimate:
+    """The fit with another covariance of x, and all spreads that it makes."""
+    return replace(fit, **_spreads(problem, fit.x, covariance))  # pyright: ignore[reportArgumentType]
+
+
 def make_estimate(
     evaluate: Evaluator,
     x: Float[Tensor, "B n"],
@@ -406,31 +429,23 @@ def make_estimate(
     report = family.describe(gamma)
     outlier, chi2, dof, explained = verdict(evaluate, sums, cost)
     rows = sums.r[:, :-TIP_ROWS]
-    tip, free = state.tip.size, state.tension.size
-    variance, of_parameters = (b.covariance(covariance).diagonal(dim1=-2, dim2=-1) for b in (state.tension, state.parameters))
-    of_loads, pad = covariance[:, state.loads.at, state.loads.at], torch.nn.functional.pad
-    drag = axial_std(family, gamma, of_loads)
+    spreads = {name: None if value is None else settled(value) for name, value in _spreads(problem, x, covariance).items()}
     return Estimate(
         x=kept(x),
-        covariance=settled(covariance),
+        **spreads,  # pyright: ignore[reportArgumentType]
         force=kept(report.force),
         location=kept(report.location),
         width=kept(report.width),
-        load_covariance=settled(load_covariance(family, gamma, of_loads)),
         net_force=kept(report.net_force),
         axial=None if report.axial is None else kept(report.axial),
-        axial_std=None if drag is None else settled(drag),
-        tip=kept(state.tip_wrench(x)) if tip else None,
-        tip_covariance=settled(pad(state.tip.covariance(covariance), (0, 6 - tip, 0, 6 - tip))) if tip else None,
+        tip=kept(state.tip_wrench(x)) if state.tip.size else None,
         base_wrench=kept(state.base.of(x)),
         registration=kept(state.registration.of(x)) if state.registration.size else None,
         centre_line=kept(sums.line),
         residual=_read_only(problem)(kept(problem.distances(rows))),
         row_residual=kept(rows),
-        tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
-        tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,
+        tension=kept(pulling) if state.tension.size and (pulling := problem.pulling(x)) is not None else None,
         parameters=kept(state.parameters.of(x)) if state.parameters.size else None,
-        parameters_std=settled(of_parameters.clamp(min=0).sqrt()) if state.parameters.size else None,
         outlier=outlier,
         cost=kept(cost),
         chi2=kept(chi2),

@@ -26,6 +26,7 @@ from . import filter as ekf
 from .evaluator import Evaluator, Run, evaluator, kernel_serves
 from .result import Estimate, limit, make_estimate
 from .starts import Fate, Origin, Start, StartRule, challenged_by_cold, cold_start, in_equilibrium
+from .tip_size import sized
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
 FEW = 1024  # samples for which torch's own share is done sooner on one thread
@@ -60,6 +61,7 @@ class Settings:
     restarts: a sample whose fit is not accepted is tried again from its loads times each of these factors, for at most
     RESTART_ITERATIONS each, and the fit of least cost is kept: a strong push near the tip has a second minimum at a quarter of
     its force.
+    sized: a wrench at the tip is taken to be no larger than the readings ask for (estimation.tip_size); False: of any size.
     gain: a sample has converged, too, when the step that the filter takes promises to lower the cost by less than this; 0: only
     when a full Gauss-Newton step does (estimation.filter.Limits).
     Errors: ValueError for numbers that no filter can be run with.
@@ -74,6 +76,7 @@ class Settings:
     restarts: tuple[float, ...] = (4.0, 2.0, 8.0)
     basins: int = BASINS
     robust: float = math.inf
+    sized: bool = True
     gain: float = 0.0
 
     def __post_init__(self):
@@ -373,13 +376,14 @@ def estimate_each(
     parts, compiled, B = [], kernel_serves(problem), problem.batch
     size = CHUNK if compiled else CHUNK_TORCH
     settings = settings or Settings()
-    solve = solver_of(settings)
+    solve, plain = solver_of(settings), solver_of(replace(settings, restarts=(), basins=0))
     # What is kept from call to call, and the answer, must serve outside of inference mode, too.
     with torch.inference_mode(False), one_thread(compiled and B <= FEW):
         for first in range(0, B, size):
             index = torch.arange(first, min(first + size, B))
             chunk = problem if len(index) == B else problem.take(index)
             fit = solve(chunk, _begin(start, chunk, index, B), progress)
+            fit = sized(chunk, fit, plain) if settings.sized else fit
             parts.append(_stable(chunk, _followed(chunk, fit, settings)))
     return Estimate.cat(parts)
 

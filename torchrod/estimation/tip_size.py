@@ -1,0 +1,106 @@
+"""How large an unknown wrench at the tip is: the size of its prior, by its evidence.
+
+Positions hardly tell a moment about the rod's axis, and of a force and a moment together little but a part: what fits best lies
+anywhere along a valley, at forces of any size. Of all that explain the readings alike, a small wrench is the likelier one:
+
+    (1)  p(t | sigma) = N(0, sigma_F^2 1) N(0, sigma_M^2 1),    log sigma even between LEAST and TIP_STD scales
+
+which is (2) of estimation.chart. Fits for a row of sizes, each begun from that of the next smaller ones, stay on the branch that
+leads to no wrench at all. By Laplace's method
+
+    (2)  log p(z | sigma) = -cost / 2 + log det C_yy / 2 - 3 log sigma_F - 3 log sigma_M + const
+
+with the fit's covariance C_yy of everything but the base wrench. The fit of the best sizes is reported, and the covariance of all
+of them about it, each weighted by (2). Source: MacKay, Neural Computation 4 (1992) 415.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..model.problem import Problem
+from ..model.unknowns import TIP_STD
+from ..util.status import Status
+from .result import Estimate, limit, with_covariance
+from .starts import Origin, Start, cold_start
+
+LEAST = 0.015  # force and moment scales
+SIZES = (LEAST, 0.08, 0.4, 2.0, TIP_STD)
+PER_BLOCK = 3  # entries of a force, and of a moment
+CHUNK = 512  # samples whose fits of all sizes are kept at a time
+Fitting = Callable[[Problem, Start], Estimate]
+
+
+def sized(problem: Problem, fit: Estimate, fitting: Fitting) -> Estimate:
+    """The fit of the best sizes, of every sample that can be fitted.
+
+    fit: by the weak prior; a problem with a prior of its own, or without an unknown moment at the tip, keeps it. fitting: a plain
+    solver.
+    """
+    if problem.state.tip.size < 2 * PER_BLOCK or problem.prior is not None:
+        return fit
+    for at in (fit.status != int(Status.INVALID)).nonzero().squeeze(-1).split(CHUNK):
+        part, given = problem.take(at), fit.of(at, problem.size)
+        tried = [(given, _log_evidence(part, given, (TIP_STD, TIP_STD)))]
+        best = _mixture(part, tried + _of_all_sizes(part, fitting))
+        fit = fit.merged(best, at, torch.isfinite(best.cost))
+    return fit
+
+
+Weighed = tuple[Estimate, Float[Tensor, " B"]]
+
+
+def _of_all_sizes(problem: Problem, fitting: Fitting) -> list[Weighed]:
+    """Fits of force and moment of every size, with (2)."""
+    found: dict[tuple[int, int], Weighed] = {}
+    x = cold_start(problem).x
+    for k in range(len(SIZES)):
+        found[k, k] = _fitted(problem, (SIZES[k], SIZES[k]), x, fitting)
+        x = found[k, k][0].x.nan_to_num(0.0)
+        for smaller in range(k):
+            for sizes in ((smaller, k), (k, smaller)):
+                found[sizes] = _fitted(problem, (SIZES[sizes[0]], SIZES[sizes[1]]), x, fitting)
+    return list(found.values())
+
+
+def _fitted(problem: Problem, sizes: tuple[float, float], x: Float[Tensor, "B n"], fitting: Fitting) -> Weighed:
+    """One fit, with the cost and the verdict of the weak prior, which the readings do not feel."""
+    at, precision = problem.state.tip.at, problem.precision.clone()
+    precision[at] = torch.tensor([size**-2 for size in sizes for _ in range(PER_BLOCK)], dtype=x.dtype)
+    fit = fitting(replace(problem, prior=(problem.mean, precision)), Start.at(x, Origin.COLD))
+    log_evidence = _log_evidence(problem, fit, sizes)
+    extra = ((precision - problem.precision)[at] * fit.x[:, at] ** 2).sum(-1)
+    cost, chi2 = fit.cost - extra, fit.chi2 - extra
+    explained = chi2 < torch.tensor([limit(k) for k in fit.dof.tolist()], dtype=x.dtype)
+    accepted = fit.accepted | (explained & (fit.status == int(Status.CONVERGED)) & ~fit.outlier.any(-1))
+    return replace(fit, cost=cost, chi2=chi2, accepted=accepted), log_evidence
+
+
+def _log_evidence(problem: Problem, fit: Estimate, sizes: tuple[float, float]) -> Float[Tensor, " B"]:
+    """(2); -inf where the fit has not converged. cost: as the fit itself has it."""
+    m = problem.state.base.at.start
+    C = fit.covariance[:, :m, :m]
+    unit = C.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
+    L = torch.linalg.cholesky_ex(C / unit.unsqueeze(-1) / unit.unsqueeze(-2))[0].diagonal(dim1=-2, dim2=-1)
+    value = -0.5 * fit.cost + (L.log() + unit.log()).sum(-1) - PER_BLOCK * sum(math.log(size) for size in sizes)
+    sound = (fit.status == int(Status.CONVERGED)) & torch.isfinite(value)
+    return torch.where(sound, value, -torch.inf)
+
+
+def _mixture(problem: Problem, tried: list[Weighed]) -> Estimate:
+    """The fit of the largest (2), with the covariance of all about it; the first where none has converged."""
+    log_evidence = torch.stack([one for _, one in tried])
+    best, everyone = log_evidence.argmax(0), torch.arange(problem.batch)
+    fit = tried[0][0]
+    for k, (other, _) in enumerate(tried[1:], 1):
+        fit = fit.merged(other, everyone, best == k)
+    weight = torch.softmax(log_evidence, 0).nan_to_num(0.0)[..., None, None]
+    off = torch.stack([other.x for other, _ in tried]) - fit.x
+    spread = torch.stack([other.covariance for other, _ in tried]) + off.unsqueeze(-1) * off.unsqueeze(-2)
+    covariance = torch.where(weight > 0, weight * spread, 0.0).sum(0)
+    known = torch.isfinite(log_evidence).any(0)[:, None, None]
+    return with_covariance(problem, fit, torch.where(known, covariance, fit.covariance))
