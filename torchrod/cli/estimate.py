@@ -11,6 +11,7 @@ from torch import Tensor
 from ..analysis.count import Hypothesis, StartFor
 from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
+from ..estimation.evaluator import kernel_serves
 from ..estimation.load_profile import Profile
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
@@ -117,6 +118,22 @@ def _own_noise(seen: Bool[Tensor, "B P"]) -> str:
     return "states the noise of every position, sx" if bool(seen.any()) else "has no positions x,y,z"
 
 
+def _sampled(options: Namespace, problem: Problem) -> bool:
+    """Whether intervals are to be of draws, which the table does not show; of a large batch only where that is asked for."""
+    if options.intervals == "gaussian" or not ((options.out and not options.out.endswith(".csv")) or options.plot):
+        return False
+    quick = kernel_serves(problem) and not options.one_frame
+    if options.intervals == "sampled" or not quick:
+        return options.intervals == "sampled"
+    if problem.batch > MOST_PROFILES:
+        warnings.warn(
+            f"the intervals of {problem.batch} samples are those of the covariance, because draws would take longer than all else; "
+            "--intervals sampled takes draws",
+            stacklevel=2,
+        )
+    return problem.batch <= MOST_PROFILES
+
+
 def _unused_intervals(options: Namespace, whole: bool) -> str:
     if options.one_frame:
         return "draws of one sample cannot have the error of a base frame that all share (--one-frame)"
@@ -181,7 +198,7 @@ def estimate(options: Namespace) -> None:
     candidates = contact_hypotheses(problem, count, options.load_prior, at, _friction(options))
     _check_enough(options, problem.of(next((c for c in candidates if c.contacts), candidates[0]).unknowns))
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
-    sampled = options.intervals == "sampled" and bool(options.out or options.plot)  # which the table does not show
+    sampled = _sampled(options, problem)
     try:
         found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar, sampled)
     except InputError:  # names its own file

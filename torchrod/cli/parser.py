@@ -99,9 +99,10 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument(
         "--intervals",
         type=str,
-        choices=["sampled", "gaussian"],
-        default="gaussian",
-        help="what the 95-percent intervals in RESULT come from: the covariance, or draws of the posterior (10 ms a shape or more)",
+        choices=["auto", "sampled", "gaussian"],
+        default="auto",
+        help="what the 95-percent intervals in RESULT come from: draws of the posterior (10 ms a shape or more) or the covariance; "
+        "auto: draws for up to 1,000 samples of markers on a robot that is taken as exact",
     )
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
     about = "whether RESULT has the load profiles and their bands; auto: up to 1,000 samples"

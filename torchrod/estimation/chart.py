@@ -54,10 +54,10 @@ def _log_normalizer(d: int, faint: float, weak: float) -> float:
     return math.log(surface * float(torch.trapezoid(density, F.log())))
 
 
-def _log_size(F: Float[Tensor, "... d"], weak: float) -> Float[Tensor, "..."]:
+def _log_size(F: Float[Tensor, "... d"], weak: float, faint: float) -> Float[Tensor, "..."]:
     """log p(F) of (2)."""
     d, square = F.shape[-1], F.square().sum(-1)
-    return -0.5 * square / weak**2 - 0.5 * d * torch.log(FAINT**2 + square) - _log_normalizer(d, FAINT, weak)
+    return -0.5 * square / weak**2 - 0.5 * d * torch.log(faint**2 + square) - _log_normalizer(d, faint, weak)
 
 
 @cache
@@ -316,16 +316,19 @@ class Chart:
         return ((self.to(y.unsqueeze(1) + step) - self.to(y.unsqueeze(1) - step)) / (2 * STEP)).mT
 
     @cached_property
-    def _scale_free(self) -> list[tuple[list[int], float]]:
-        """The entries that are forces or moments of any size, by which size they share, each with its weak prior's deviation."""
+    def _scale_free(self) -> list[tuple[list[int], float, float]]:
+        """The entries that are forces or moments of any size, by which size they share, each with its weak prior's deviation and
+        what is faint: of a force on a flat rod beside what bends it along its soft side.
+        """
         loads, found = self.problem.unknowns.loads, []
         if self.problem.prior is not None:
             return found
         if isinstance(loads, GaussianCoordinates | PointCoordinates) and loads.force_std == WEAK_STD and loads.count:
             lateral = [loads.per_load * k + i for k in range(loads.count) for i in range(2)]
-            found.append((lateral + (self.along if loads.friction == math.inf else []), WEAK_STD))
+            faint = FAINT * min(1.0, *self.problem.robot.rod.sides)
+            found.append((lateral + (self.along if loads.friction == math.inf else []), WEAK_STD, faint))
         tip = self.problem.state.tip.at
-        return found + [(list(range(first, first + 3)), TIP_STD) for first in range(tip.start, tip.stop, 3)]
+        return found + [(list(range(first, first + 3)), TIP_STD, FAINT) for first in range(tip.start, tip.stop, 3)]
 
     def fitted_prior(self, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"]:
         """What the fit's cost holds of its own prior."""
@@ -337,8 +340,8 @@ class Chart:
         m, total = self.size, y.new_zeros(y.shape[:-1])
         mean, precision = ((v.unsqueeze(1) if v.ndim > 1 else v)[..., :m] for v in (self.problem.mean, self.problem.precision))
         normal = torch.ones(m, dtype=torch.bool)
-        for at, weak in self._scale_free:
-            total = total + _log_size(y[..., at], weak)
+        for at, weak, faint in self._scale_free:
+            total = total + _log_size(y[..., at], weak, faint)
             normal[at] = False
         for i in self.places if self.problem.prior is None else ():
             total = total + torch.nn.functional.logsigmoid(y[..., i]) + torch.nn.functional.logsigmoid(-y[..., i])

@@ -1,7 +1,7 @@
 """Draws of the posterior of x, where the ellipse about the fit does not do: importance sampling, and tempering where that fails.
 
 The tip condition (17) holds exactly, so a draw is one of everything but the base wrench (estimation.chart), which equilibrium then
-gives: by one walk from the tip where no weight acts, else by Newton steps on the tip residual. The target is
+gives: by a walk from the tip, or a few where weight acts, else by Newton steps on the tip residual. The target is
 
     (1)  log pi(v) = -cost(x(v)) / 2 + log p(y) + log |det dy/dv|
 
@@ -55,6 +55,7 @@ MOVES = 3  # Metropolis steps at a temperature
 LAST_MOVES = 8
 MOST_TEMPERATURES = 40
 FINE = 2.5e-4  # of the length: markers less exact than that cannot tell COARSE_STEPS from the fit's own
+CLAMPED, LEAST_CLAMPED = 0.01, 1e-9  # by how much the base may miss its clamp: of the noise at the tip, rad
 NEWTON = 6
 SETTLED = 1.0  # of the tip's cost: from there one more Newton step is exact to second order
 
@@ -196,7 +197,14 @@ class _Target:
         self.follow = follow.nan_to_num(0.0)  # d alpha / dy along the equilibria near the fit
         self._spread: tuple[Int[Tensor, " b"], int, Chart, Evaluator] | None = None
         state, robot = problem.state, problem.robot
-        self.light = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and robot.weightless
+        smooth = robot.tendons.friction is None
+        self.walks = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and smooth
+        self.q_tip = None if robot.weightless or not self.walks else self.problem.shape(x, differentiable=False).tip_q
+        markers = self.problem.markers
+        plain = markers is not None and markers.isotropic and markers.offsets is None and self.problem.warp is None
+        self.bare = plain and math.isinf(nu) and not (state.registration.size or state.parameters.size)
+        least = float(self.problem.weights[:, :-TIP_ROWS].max()) ** -0.5 / robot.rod.length if plain else 0.0
+        self.clamped = max(CLAMPED * least, LEAST_CLAMPED)
 
     def _of(self, index: Int[Tensor, " b"], count: int) -> tuple[Chart, Evaluator]:
         """The chart of samples of an index, and the evaluator of so many draws of each."""
@@ -212,23 +220,32 @@ class _Target:
         chart, evaluate = self._of(index, D)
         y, log_volume = chart.back(v)
         flat, rows = y.flatten(0, 1), index.repeat_interleave(D)
-        cost, x = self._by_one_walk(evaluate, flat) if self._walks(evaluate) else self._by_newton(evaluate, flat, rows)
+        by_walks = self.walks and isinstance(evaluate, KernelEvaluator)
+        cost, x = self._by_walks(evaluate, flat, rows) if by_walks else self._by_newton(evaluate, flat, rows)
         cost, x = cost.unflatten(0, (b, D)), x.unflatten(0, (b, D))
+        if by_walks and not self.bare:
+            cost = cost - chart.fitted_prior(x)
         for near, far in itertools.pairwise(chart.in_order.mT):  # the same loads in another order are no other explanation
             apart = y.gather(-1, far.expand(D, 1, b).movedim(-1, 0)) - y.gather(-1, near.expand(D, 1, b).movedim(-1, 0))
             log_volume = torch.where(apart.squeeze(-1) >= 0, log_volume, -torch.inf)
-        log_pi = -0.5 * (cost - (chart.fitted_prior(x) if self._walks(evaluate) else 0.0)) + chart.log_prior(y) + log_volume
+        log_pi = -0.5 * cost + chart.log_prior(y) + log_volume
         return log_pi.nan_to_num(-torch.inf, -torch.inf, -torch.inf), x
 
-    def _walks(self, evaluate: Evaluator) -> bool:
-        return self.light and isinstance(evaluate, KernelEvaluator)
-
-    def _by_one_walk(self, evaluate: Evaluator, y: Float[Tensor, "N m"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
+    def _by_walks(
+        self, evaluate: Evaluator, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
+        """The cost, by the forward solve from tip to base: one walk without weight. With the fit's prior, but where bare."""
         assert isinstance(evaluate, KernelEvaluator)
-        state = self.problem.state
-        wrench, _, _ = evaluate.balance(y[:, state.loads.at].contiguous(), None, 1, 1.0)
+        state, q_tip = self.problem.state, None if self.q_tip is None else self.q_tip[rows]
+        wrench, missed, line = evaluate.balance(y[:, state.loads.at].contiguous(), q_tip, 1, self.clamped)
         x = torch.cat([y, wrench / state.base.unit], -1)
-        return evaluate.cost(x), x
+        if not self.bare:
+            return torch.where(missed <= self.clamped, evaluate.cost(x), torch.inf), x
+        W, z = (v[:, :-TIP_ROWS].unsqueeze(1) for v in (self.problem.weights, self.problem.reading.nan_to_num(0.0)))
+        each, many = rows.unique_consecutive(return_counts=True)
+        off = line.reshape(len(each), int(many[0]), -1) - z[each]
+        cost = (W[each] * off.square()).sum(-1).flatten()
+        return torch.where(missed <= self.clamped, cost, torch.inf), x
 
     def _by_newton(
         self, evaluate: Evaluator, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]
@@ -552,6 +569,8 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
         return Draws(problem, x, weight, 0 * known, draws * known, -0.5 * estimate.cost * known, fine * int(Method.IMPORTANCE))
     with torch.inference_mode(False), one_thread():
         for rows in fine.nonzero().squeeze(-1).split(max(1, ROWS // draws)):
+            if not len(rows):
+                continue
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
             C = estimate.covariance[rows]
             target = _Target(part, estimate.x[rows], C, nu)

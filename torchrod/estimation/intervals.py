@@ -11,17 +11,20 @@ from torch import Tensor
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
-from .draws import DRAWS, Draws, picked, posterior_draws, systematic
+from .draws import DRAWS, Draws, Method, picked, posterior_draws, systematic
 from .load_profile import DRAWS as OF_BAND
 from .load_profile import LEVELS, NODES, band_of_draws
-from .result import Estimate
+from .result import Z95, Estimate
 
+FLAT = 0.3  # times EI: how stiff the soft side of a flat rod is at most
+NEXT_TO_NONE = 1e-3  # of the draws: below it lies what stands for the least
 CHUNK = 64  # samples at a time: their draws are not kept
 
 
 @dataclass(frozen=True)
 class Intervals:
-    """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1).
+    """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1). Where the
+    first proposal did not do (method), those of loads and tip take in the normal ones.
 
     magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
     along the rod, or None. resultant (B, 4, 2) N: of the
@@ -42,17 +45,31 @@ class Intervals:
     method: Int[Tensor, " B"]
 
 
-def quantiles(values: Float[Tensor, "B D k"], weight: Float[Tensor, "B D"]) -> Float[Tensor, "B k 2"]:
-    """The weighted quantiles of LEVELS, linear between the draws."""
+def quantiles(
+    values: Float[Tensor, "B D k"], weight: Float[Tensor, "B D"], levels: tuple[float, float] = LEVELS
+) -> Float[Tensor, "B k 2"]:
+    """The weighted quantiles of two levels, linear between the draws."""
     ordered, order = values.movedim(1, -1).sort(-1)
     share = weight.unsqueeze(1).expand(-1, values.shape[-1], -1).gather(-1, order)
     ends = share.cumsum(-1) - 0.5 * share
     found = []
-    for level in LEVELS:
+    for level in levels:
         i = torch.searchsorted(ends.contiguous(), torch.full_like(ends[..., :1], level)).clamp(1, ends.shape[-1] - 1)
         (e0, e1), (v0, v1) = ((t.gather(-1, i - 1), t.gather(-1, i)) for t in (ends, ordered))
         found.append(v0 + ((level - e0) / (e1 - e0).clamp(min=1e-300)).clamp(0, 1) * (v1 - v0))
     return torch.cat(found, -1)
+
+
+def of_sizes(values: Float[Tensor, "B D k"], weight: Float[Tensor, "B D"], flat: bool) -> Float[Tensor, "B k 2"]:
+    """Intervals of sizes; on a flat rod from the least draw up, where that is shorter than between the quantiles of LEVELS.
+
+    There a force's component along the stiff side hardly shows, and its likeliest size is the least one.
+    """
+    if not flat:
+        return quantiles(values, weight)
+    both, below = quantiles(values, weight), quantiles(values, weight, (NEXT_TO_NONE, LEVELS[1] - LEVELS[0]))
+    shorter = below[..., 1] - below[..., 0] < both[..., 1] - both[..., 0]
+    return torch.where(shorter.unsqueeze(-1), below, both)
 
 
 def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:
@@ -67,13 +84,15 @@ def intervals(draws: Draws) -> Intervals:
     family, state = problem.unknowns.loads, problem.state
     gamma = x[..., state.loads.at]
     report, R = family.describe(gamma), resultant(problem, x)
-    values = [report.force.norm(dim=-1), report.location, report.force.flatten(-2), R, R.norm(dim=-1, keepdim=True)]
+    values = [report.location, report.force.flatten(-2), R]
     values += [x.new_zeros(*x.shape[:-1], 0) if report.axial is None else report.axial]
     if state.tip.size:
         values.append(state.tip_wrench(x))
     parts = quantiles(torch.cat(values, -1), weight).split([v.shape[-1] for v in values], 1)
-    size, place, force, axial, tip, K = *parts[:3], parts[5], parts[-1], report.location.shape[-1]
-    whole = torch.cat(parts[3:5], 1)
+    place, force, whole, axial, tip, K = *parts[:4], parts[-1], report.location.shape[-1]
+    flat = min(problem.robot.rod.sides) < FLAT
+    sizes = of_sizes(torch.cat([report.force.norm(dim=-1), R.norm(dim=-1, keepdim=True)], -1), weight, flat)
+    size, whole = sizes[:, :K], torch.cat([whole, sizes[:, K:]], 1)
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
     band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
     numbers = draws.k_hat, draws.ess, draws.method
@@ -125,4 +144,32 @@ def sampled_intervals(
                     whole["band"] = None
                 elif value is not None and into is not None:
                     into[(rows, *(slice(0, n) for n in value.shape[1:]))] = value
-    return Intervals(**whole)  # pyright: ignore[reportArgumentType]
+    return _hull(Intervals(**whole), estimate)  # pyright: ignore[reportArgumentType]
+
+
+def _hull(drawn: Intervals, fit: Estimate) -> Intervals:
+    """With the normal intervals in them where the first proposal did not do: then the draws may miss a part of the posterior."""
+    doubtful = drawn.method > int(Method.IMPORTANCE)
+
+    def joined(own: Tensor | None, normal: Tensor | None) -> Tensor | None:
+        if own is None or normal is None:
+            return own
+        both = torch.stack([own[..., 0].minimum(normal[..., 0]), own[..., 1].maximum(normal[..., 1])], -1)
+        return torch.where(doubtful.reshape(-1, *[1] * (own.ndim - 1)) & torch.isfinite(both), both, own)
+
+    def about(value: Tensor | None, std: Tensor | None) -> Tensor | None:
+        return (
+            None if value is None or std is None else value.unsqueeze(-1) + std.unsqueeze(-1) * Z95 * value.new_tensor([-1.0, 1.0])
+        )
+
+    def deviations(C: Tensor | None) -> Tensor | None:
+        return None if C is None else C.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+
+    return replace(
+        drawn,
+        magnitude=joined(drawn.magnitude, fit.magnitude_interval),
+        location=joined(drawn.location, fit.location_interval),
+        force=joined(drawn.force, about(fit.force, deviations(fit.load_covariance[..., :2, :2]))),
+        axial=joined(drawn.axial, about(fit.axial, fit.axial_std)),
+        tip=joined(drawn.tip, about(fit.tip, deviations(fit.tip_covariance))),
+    )
