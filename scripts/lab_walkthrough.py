@@ -35,7 +35,8 @@ def main() -> int:
                 with contextlib.redirect_stdout(io.StringIO()) as said:
                     if torchrod(command.split()):
                         return 2
-                print(f"torchrod {command}\n    {said.getvalue().splitlines()[-1]}", flush=True)
+                lines = said.getvalue().splitlines()
+                print(f"torchrod {command}\n    {next((x for x in lines if x.endswith(' accepted')), lines[-1])}", flush=True)
             spent = time.process_time() - start
             found = judged(case, Path(folder, "loads.json"))
             os.chdir(home)

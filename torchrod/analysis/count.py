@@ -25,6 +25,7 @@ from .score_test import score_test, start_with_one_more
 
 PROMISING = 0.4  # one more load is tried where the score test promises this much of what BIC asks for: it is linear, so only a hint
 MAX_CONTACTS = 3
+CLOSE = 0.1  # of the probability: an explanation with more is told
 Parts = list[tuple[Unknowns, Int[Tensor, " b"]]]
 StartFor = Callable[[Problem], StartRule]
 
@@ -58,7 +59,8 @@ class Evidence:
 
     NaN where a hypothesis was not needed, inf where its fit did not converge. foreseen (B, H): the BIC that the score test of the
     fit with one load less promises, to first order, by which a hypothesis was needed or not; NaN where there is no such fit. spare:
-    the names of those that are tried only where the others do not serve.
+    the names of those that are tried only where the others do not serve. probability (B, H): of each hypothesis, by draws of its
+    posterior (analysis.averaging), by which then the choice goes; None without draws. loaded (H): which of them have a load at all.
     """
 
     names: tuple[str, ...]
@@ -66,6 +68,27 @@ class Evidence:
     bic: Float[Tensor, "B H"]
     foreseen: Float[Tensor, "B H"]
     spare: frozenset[str] = frozenset()
+    probability: Float[Tensor, "B H"] | None = None
+    loaded: Bool[Tensor, " H"] | None = None
+
+    @property
+    def something(self) -> Float[Tensor, " B"] | None:
+        """The probability that anything pushes at all."""
+        return None if self.probability is None or self.loaded is None else self.probability[:, self.loaded].sum(-1)
+
+    def rival(self, sample: int) -> str:
+        """A sentence on another explanation that is nearly as probable as the one that was chosen; "" where there is none."""
+        if self.probability is None:
+            return ""
+        share = self.probability[sample].nan_to_num(0.0)
+        chosen, rest = int(self.choice[sample]), share.index_fill(0, self.choice[sample], 0.0)
+        best = int(rest.argmax())
+        if float(rest[best]) < CLOSE:
+            return ""
+        both = (
+            f"{self.names[chosen]} ({100 * float(share[chosen]):.0f} %) and {self.names[best]} ({100 * float(share[best]):.0f} %)"
+        )
+        return f"Among the numbers and kinds of loads, {both} explain the readings nearly alike."
 
 
 @dataclass(frozen=True)
@@ -113,6 +136,15 @@ class _Selection:
         self.scores[rows, h], self.choice[rows] = score[better], h
 
 
+@dataclass(frozen=True)
+class Selection:
+    """What the stages found: the fit that was chosen for each sample, why, and every other fit with the samples that it is of."""
+
+    fit: Estimate
+    evidence: Evidence
+    fits: dict[int, tuple[Estimate, Int[Tensor, " b"]]]
+
+
 def select(
     problem: Problem,
     candidates: Sequence[Hypothesis],
@@ -120,6 +152,18 @@ def select(
     start: StartFor = always_cold,
     bar: Bar = no_bar,
 ) -> tuple[Estimate, Evidence]:
+    """The fit of the hypothesis that `selection` chooses for each sample, and why."""
+    found = selection(problem, candidates, settings, start, bar)
+    return found.fit, found.evidence
+
+
+def selection(
+    problem: Problem,
+    candidates: Sequence[Hypothesis],
+    settings: Settings | None = None,
+    start: StartFor = always_cold,
+    bar: Bar = no_bar,
+) -> Selection:
     """Fit the hypotheses stage by stage, the fewest contacts first, and keep, per sample, the one of least BIC.
 
     problem: robot and readings; its unknowns are replaced by each candidate's. Loads that the chosen hypothesis does not have are
@@ -162,7 +206,9 @@ def select(
     if settings.restarts:
         _try_again(chosen, problems, settings, start)
     spare = frozenset(h.name for h in candidates if h.spare)
-    return chosen.fit, Evidence(tuple(h.name for h in candidates), chosen.choice, chosen.scores, chosen.foreseen, spare)
+    loaded = torch.tensor([p.state.external.stop > 0 for p in problems])
+    evidence = Evidence(tuple(h.name for h in candidates), chosen.choice, chosen.scores, chosen.foreseen, spare, loaded=loaded)
+    return Selection(chosen.fit, evidence, fits)
 
 
 def _wanting(spare: Hypothesis, candidates: Sequence[Hypothesis], chosen: _Selection) -> Int[Tensor, " b"]:

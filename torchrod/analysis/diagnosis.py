@@ -60,6 +60,7 @@ class Diagnosis:
     sample the markers without which a robust fit explains the others. couple (B,): where (m) loads, or those of one load more, are
     a large opposite couple, which no contact is; NaN where there is none. tip_instead (B,): where a force at the tip explains the
     shape with fewer contacts than without it. others: per sample what else explains its readings; () where nothing was looked for.
+    rivals: per sample a word on a hypothesis that is nearly as probable as the one that was chosen; () without probabilities.
     """
 
     s: Float[Tensor, " P"]
@@ -71,6 +72,7 @@ class Diagnosis:
     couple: Float[Tensor, " B"]
     tip_instead: Bool[Tensor, " B"]
     others: tuple[tuple[Solution, ...], ...] = ()
+    rivals: tuple[str, ...] = ()
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
         """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
@@ -86,8 +88,8 @@ class Diagnosis:
     def told(self) -> list[bool]:
         """Of which samples there is something to say."""
         doubt = torch.isfinite(self.registration).all(-1) | self.one_more | torch.isfinite(self.couple) | self.tip_instead
-        others = self.others or [()] * len(doubt)
-        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others)
+        others, rivals = self.others or [()] * len(doubt), self.rivals or [""] * len(doubt)
+        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others, rivals)
         return [any(parts) for parts in zip(*by_kind, strict=True)]
 
     def message(self, sample: int) -> str:
@@ -124,6 +126,8 @@ class Diagnosis:
             said.append(
                 f"The rod is read at few places, and its readings are explained as well by {told}{more}; add sensors along it."
             )
+        if self.rivals and self.rivals[sample]:
+            said.append(self.rivals[sample])
         return " ".join(said)
 
 

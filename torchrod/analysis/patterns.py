@@ -97,9 +97,10 @@ def joined_evidence(parts: Sequence[Evidence | None], found: Sequence[Pattern], 
     known = [p for p in parts if p is not None]
     if len(known) < len(parts):
         return None
-    choice, bic, foreseen = (_whole([getattr(p, f) for p in known], found, count) for f in ("choice", "bic", "foreseen"))
+    of_samples = ("choice", "bic", "foreseen", "probability")
+    choice, bic, foreseen, probability = (_whole([getattr(p, f) for p in known], found, count) for f in of_samples)
     assert choice is not None and bic is not None and foreseen is not None
-    return Evidence(known[0].names, choice, bic, foreseen)
+    return Evidence(known[0].names, choice, bic, foreseen, known[0].spare, probability, known[0].loaded)
 
 
 def joined_noise(parts: Sequence[Noise | None], found: Sequence[Pattern], count: int) -> Noise | None:
@@ -129,6 +130,7 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
     exchanged: list[tuple[tuple[int, ...], ...]] = [()] * B
     geometry, outliers = [""] * B, [()] * B
     others: list[tuple[Solution, ...]] = [()] * B
+    rivals = [""] * B
     for part, pattern in zip(parts, found, strict=True):
         at = pattern.places.tolist()
         for k, b in enumerate(pattern.samples.tolist()):
@@ -136,6 +138,16 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
             outliers[b] = tuple(at[i] for i in part.outliers[k])
             geometry[b] = part.geometry[k]
             others[b] = part.others[k] if part.others else ()
+            rivals[b] = part.rivals[k] if part.rivals else ""
     return Diagnosis(
-        problem.s, tuple(exchanged), registration, more, tuple(geometry), tuple(outliers), couple, instead, tuple(others)
+        problem.s,
+        tuple(exchanged),
+        registration,
+        more,
+        tuple(geometry),
+        tuple(outliers),
+        couple,
+        instead,
+        tuple(others),
+        tuple(rivals),
     )

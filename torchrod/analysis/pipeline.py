@@ -21,7 +21,8 @@ from ..model.problem import Problem
 from ..model.sensors import TipWrench
 from ..model.unknowns import Scope, Unknowns
 from .alternatives import other_solutions
-from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, select
+from .averaging import average
+from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, selection
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
 from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_intervals, joined_noise, part_of, patterns
@@ -105,7 +106,7 @@ class Analysis:
         return load_places(self.problem, self.parts, self.estimate)
 
     def message(self, sample: int) -> str:
-        """What became of a sample, what is wrong with it, and what to do."""
+        """What became of a sample, what is wrong with it, what else explains it, and what to do."""
         return f"{self.estimate.message(sample)} {self.diagnosis.message(sample)}".rstrip()
 
 
@@ -123,9 +124,9 @@ def analyze(
     problem: robot, unknowns and readings. candidates: hypotheses that compete (`contact_hypotheses`); None: the problem's unknowns
     alone. unknown_noise: estimate the markers' noise of each sample from the residual; what the markers state plays no part then. A
     registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
-    progress, called with a total and a name. sampled: intervals and bands from draws of the posterior
-    (estimation.draws); not where all samples share a base frame, whose error the draws of one sample cannot have.
-    Errors: ValueError as torchrod.estimate.
+    progress, called with a total and a name. sampled: intervals and bands from draws of the posterior (estimation.draws), and the
+    choice among hypotheses by their probabilities (analysis.averaging); not where all samples share a base frame, whose error the
+    draws of one sample cannot have. Errors: ValueError as torchrod.estimate.
     """
     registration = problem.unknowns.registration
     split = patterns(problem) if registration is None or registration.scope is not Scope.SHARED else []
@@ -143,12 +144,18 @@ def analyze(
         noise, sigma = estimate_noise_among(problem, kin, settings)
         problem = with_noise(problem, sigma)
     evidence: Evidence | None = None
+    drawn: Intervals | None = None
+    shared = registration is not None and registration.scope is Scope.SHARED
 
     def fitted(problem: Problem) -> tuple[Estimate, Parts]:
-        nonlocal evidence
+        nonlocal evidence, drawn
         own = [replace(c, unknowns=replace(c.unknowns, registration=problem.unknowns.registration)) for c in competing]
         if len(own) > 1:
-            found, evidence = select(problem, own, settings, start, bar)
+            chosen = selection(problem, own, settings, start, bar)
+            found, evidence = chosen.fit, chosen.evidence
+            if sampled and not shared:
+                averaged = average(problem, own, chosen, settings.robust, bar)
+                found, evidence, drawn = averaged.fit, averaged.evidence, averaged.intervals
             return found, parts_of(own, evidence)
         only = problem.of(own[0].unknowns)
         with bar(problem.batch, f"{own[0].contacts} contact{'s' * (own[0].contacts != 1)}") as shown:
@@ -156,17 +163,20 @@ def analyze(
         return found, [(only.unknowns, torch.arange(problem.batch))]
 
     frame = None
-    if registration is not None and registration.scope is Scope.SHARED:
+    if shared:
         with bar(STEPS * problem.batch, "base frame") as shown:
-            shared = with_shared_frame(problem, fitted, settings, shown.update)
-        found, parts, frame, problem = shared.estimate, shared.parts, shared.frame, shared.problem
+            common = with_shared_frame(problem, fitted, settings, shown.update)
+        found, parts, frame, problem = common.estimate, common.parts, common.frame, common.problem
     else:
         found, parts = fitted(problem)
     if len(parts) == 1:
         problem = problem.of(parts[0][0])
     found = found if noise is None else noise.judged(found)
     diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
-    drawn = sampled_intervals(problem, found, parts, nu=settings.robust) if sampled and frame is None else None
+    if evidence is not None and evidence.probability is not None:
+        diagnosis = replace(diagnosis, rivals=tuple(evidence.rival(b) for b in range(problem.batch)))
+    if sampled and not shared and drawn is None:
+        drawn = sampled_intervals(problem, found, parts, nu=settings.robust)
     return Analysis(problem, found, parts, evidence, noise, frame, diagnosis, drawn)
 
 

@@ -40,9 +40,10 @@ from .table import table
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
 ANGLE_NOISE = 0.01  # rad
 EXACT = (
-    "The robot is taken as exact, its tensions, friction and stiffness too. What is only nearly known passes for a load; state it "
-    "under [uncertainty] of ROBOT.toml, or calibrate it."
+    "The robot is taken as exact, its {parts} too. What is only nearly known passes for a load; state it under [uncertainty] of "
+    "ROBOT.toml, or calibrate it."
 )
+LATERAL = " Contacts are taken to push without drag along the rod; where they rub, state --contact-friction."
 NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
 
@@ -118,16 +119,20 @@ def _own_noise(seen: Bool[Tensor, "B P"]) -> str:
     return "states the noise of every position, sx" if bool(seen.any()) else "has no positions x,y,z"
 
 
-def _sampled(options: Namespace, problem: Problem) -> bool:
-    """Whether intervals are to be of draws, which the table does not show; of a large batch only where that is asked for."""
-    if options.intervals == "gaussian" or not ((options.out and not options.out.endswith(".csv")) or options.plot):
+def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
+    """Whether there are to be draws: of one hypothesis where its intervals are shown, of several to choose; of a large batch only
+    where that is asked for.
+    """
+    shown = bool((options.out and not options.out.endswith(".csv")) or options.plot)
+    if options.intervals == "gaussian" or not (shown or several):
         return False
     quick = kernel_serves(problem) and not options.one_frame
     if options.intervals == "sampled" or not quick:
         return options.intervals == "sampled"
     if problem.batch > MOST_PROFILES:
         warnings.warn(
-            f"the intervals of {problem.batch} samples are those of the covariance, because draws would take longer than all else; "
+            f"the intervals of {problem.batch} samples are those of the covariance"
+            f"{' and the choice of loads that of the BIC' * several}, because draws would take longer than all else; "
             "--intervals sampled takes draws",
             stacklevel=2,
         )
@@ -137,6 +142,8 @@ def _sampled(options: Namespace, problem: Problem) -> bool:
 def _unused_intervals(options: Namespace, whole: bool) -> str:
     if options.one_frame:
         return "draws of one sample cannot have the error of a base frame that all share (--one-frame)"
+    if options.contacts == "auto" or options.load_prior == "auto":
+        return ""
     return "" if whole or options.plot else "only RESULT.json, RESULT.npz and FIGURE show intervals; name one by --out or --plot"
 
 
@@ -198,7 +205,7 @@ def estimate(options: Namespace) -> None:
     candidates = contact_hypotheses(problem, count, options.load_prior, at, _friction(options))
     _check_enough(options, problem.of(next((c for c in candidates if c.contacts), candidates[0]).unknowns))
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
-    sampled = _sampled(options, problem)
+    sampled = _sampled(options, problem, len(candidates) > 1)
     try:
         found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar, sampled)
     except InputError:  # names its own file
@@ -207,8 +214,9 @@ def estimate(options: Namespace) -> None:
         raise InputError(f"{options.shapes}: {error}") from None
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
-    if len(robot.tendons) and problem.unknowns.uncertainty is None and not problem.state.tension.size:
-        print(EXACT)  # noqa: T201
+    if problem.unknowns.uncertainty is None and not problem.state.tension.size:
+        parts = "tensions, friction and stiffness" if len(robot.tendons) else "stiffness"
+        print(EXACT.format(parts=parts) + LATERAL * (_friction(options) is None and options.contacts != "0"))  # noqa: T201
     if options.out:
         said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
         nearly = problem.unknowns.uncertainty

@@ -16,7 +16,7 @@ The random numbers are always the same: equal fits have equal draws, whatever th
 
 import itertools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cache
 
@@ -91,6 +91,11 @@ class Draws:
     ess: Float[Tensor, " B"]
     log_evidence: Float[Tensor, " B"]
     method: Int[Tensor, " B"]
+
+    def take(self, index: Int[Tensor, " b"]) -> "Draws":
+        """The samples of an index."""
+        own = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "problem"}
+        return Draws(self.problem.take(index), **own)
 
 
 @cache

@@ -124,27 +124,49 @@ def sampled_intervals(
     posterior_draws.
     """
     parts = [(problem.unknowns, torch.arange(problem.batch))] if parts is None else parts
-    B, K = estimate.location.shape
-    whole: dict[str, Tensor | None] = {}
-    shapes = {"magnitude": (K, 2), "location": (K, 2), "force": (K, 2, 2), "resultant": (4, 2), "k_hat": (), "ess": ()}
-    for name, shape in shapes.items():
-        whole[name] = torch.full((B, *shape), torch.nan, dtype=DTYPE)
-    whole["axial"] = None if estimate.axial is None else torch.full((B, K, 2), torch.nan, dtype=DTYPE)
-    whole["tip"] = None if estimate.tip is None else torch.full((B, 6, 2), torch.nan, dtype=DTYPE)
-    whole["band"], whole["method"] = torch.full((B, NODES, 3, 2), torch.nan, dtype=DTYPE), torch.zeros(B, dtype=torch.int64)
+    found = Collected(estimate)
     for unknowns, index in parts:
         own = problem.of(unknowns) if unknowns is not problem.unknowns else problem
         for rows in index.split(CHUNK):
-            if not len(rows):
-                continue
-            made = intervals(posterior_draws(own.take(rows), estimate.of(rows, own.size), draws, nu))
-            for f in fields(Intervals):
-                value, into = getattr(made, f.name), whole[f.name]
-                if f.name == "band" and value is None:
-                    whole["band"] = None
-                elif value is not None and into is not None:
-                    into[(rows, *(slice(0, n) for n in value.shape[1:]))] = value
-    return _hull(Intervals(**whole), estimate)  # pyright: ignore[reportArgumentType]
+            if len(rows):
+                found.put(rows, intervals(posterior_draws(own.take(rows), estimate.of(rows, own.size), draws, nu)))
+    return found.whole(estimate)
+
+
+class Collected:
+    """Intervals of a batch, put together from those of some samples at a time; NaN where there are none."""
+
+    def __init__(self, like: Estimate):
+        """like: the fit of the whole batch, which says what there is to have intervals of."""
+        B, K = like.location.shape
+        shapes: dict[str, tuple[int, ...] | None] = {
+            "magnitude": (K, 2),
+            "location": (K, 2),
+            "force": (K, 2, 2),
+            "axial": None if like.axial is None else (K, 2),
+            "resultant": (4, 2),
+            "tip": None if like.tip is None else (6, 2),
+            "band": (NODES, 3, 2),
+            "k_hat": (),
+            "ess": (),
+        }
+        full = (
+            (name, None if shape is None else torch.full((B, *shape), torch.nan, dtype=DTYPE)) for name, shape in shapes.items()
+        )
+        self.values: dict[str, Tensor | None] = dict(full) | {"method": torch.zeros(B, dtype=torch.int64)}
+
+    def put(self, rows: Int[Tensor, " b"], made: Intervals) -> None:
+        """Those of some samples, in place of what was there."""
+        for f in fields(Intervals):
+            value, into = getattr(made, f.name), self.values[f.name]
+            if f.name == "band" and value is None:
+                self.values["band"] = None
+            elif value is not None and into is not None:
+                into[(rows, *(slice(0, n) for n in value.shape[1:]))] = value
+
+    def whole(self, fit: Estimate) -> Intervals:
+        """Of all samples of a fit."""
+        return _hull(Intervals(**self.values), fit)  # pyright: ignore[reportArgumentType]
 
 
 def _hull(drawn: Intervals, fit: Estimate) -> Intervals:

@@ -120,6 +120,13 @@ def band_of_draws(family: LoadFamily, gamma: Float[Tensor, "B D g"], s: Float[Te
     return torch.cat([_quantiles(family, some, s) for some in gamma.split(CHUNK)])
 
 
+def densities(family: LoadFamily, gamma: Float[Tensor, "b D g"], s: Float[Tensor, " S"]) -> Float[Tensor, "b 3 S D"] | None:
+    """f_x, f_y and |f| (N/m) of draws, in single precision; None for point loads."""
+    if family.size == 0:
+        return torch.zeros(len(gamma), 3, len(s), gamma.shape[1])
+    return None if _density(family, gamma[:1, :1], s) is None else _values(family, gamma, s)
+
+
 def load_profile(
     problem: Problem, x: Float[Tensor, "B n"], covariance: Float[Tensor, "B n n"], nodes: int = NODES
 ) -> Profile | None:

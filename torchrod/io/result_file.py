@@ -209,8 +209,14 @@ def _profile(profile: Profile, b: int) -> str:
 def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
     every = zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True)
     rows = [row for row in every if row[0] not in evidence.spare or not math.isnan(row[1])]
+    by_draws: dict[str, object] = {}
+    if evidence.probability is not None and evidence.something is not None:
+        shares = zip(evidence.names, evidence.probability[b].tolist(), strict=True)
+        by_draws["probability"] = {name: plain(share) for name, share in shares if share > 0}
+        by_draws["probability_of_any_load"] = plain(float(evidence.something[b]))
     return {
         "chosen": evidence.names[int(evidence.choice[b])],
+        **by_draws,
         "bic": {name: plain(value) for name, value, _ in rows},
         "not_converged": [name for name, value, _ in rows if math.isinf(value)],
         "bic_foreseen": {name: plain(promised) for name, value, promised in rows if math.isnan(value)},
@@ -335,6 +341,7 @@ def write_result(
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
         names["hypotheses"] = np.array(evidence.names)
+        arrays["probability"] = evidence.probability
     for name in ("magnitude_location_covariance", "warm_started"):
         arrays[name] = getattr(estimate, name)
     arrays |= {f"{name}_interval": _merged(estimate, intervals, name) for name in ("magnitude", "location")}

@@ -1,0 +1,90 @@
+"""Probabilities of hypotheses, and what is averaged by them."""
+
+import json
+import math
+
+import torch
+
+from tests.robots import steel_rod
+from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Unknowns, analyze, contact_hypotheses, solve_shape
+from torchrod.analysis.averaging import ONE_MORE, average
+from torchrod.analysis.count import selection
+from torchrod.cli import main
+from torchrod.estimation.draws import posterior_draws
+from torchrod.util.precision import DTYPE
+
+L, NOISE = 0.4, 1e-3
+S = torch.linspace(L / 20, L, 20, dtype=DTYPE)
+
+
+def posed(B: int, seed: int, size: tuple[float, float], gap: float = 0.0) -> tuple[Problem, torch.Tensor]:
+    """One push, or two `gap` apart (m); the resultant (N, base frame)."""
+    random, robot = torch.Generator().manual_seed(seed), steel_rod()
+    K = 1 + (gap > 0)
+    first = 0.15 + (0.2 - gap) * torch.rand(B, 1, generator=random, dtype=DTYPE)
+    place = first + gap * torch.arange(K, dtype=DTYPE)
+    force = size[0] + (size[1] - size[0]) * torch.rand(B, K, generator=random, dtype=DTYPE)
+    turn = 2 * math.pi * torch.rand(B, K, generator=random, dtype=DTYPE)
+    F = torch.stack([force * turn.cos(), force * turn.sin(), 0 * force], -1)
+    rod = solve_shape(robot, (PointForces(F, place),), None, S, B, 80)
+    p = rod.p + NOISE * torch.randn(rod.p.shape, generator=random, dtype=DTYPE)
+    unknowns = Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale))
+    return Problem(robot, unknowns, [Markers(S, p, NOISE)]), rod.base_wrench[:, :3]
+
+
+def test_probabilities_are_those_of_the_evidence():
+    """By hand from the draws of every hypothesis: a weak push that may be none."""
+    problem, _ = posed(8, 1, (0.002, 0.02))
+    candidates = contact_hypotheses(problem)[:2]
+    found = average(problem, candidates, selection(problem, candidates))
+    evidence = []
+    for candidate in candidates:
+        own = problem.of(candidate.unknowns)
+        fit = selection(problem, [candidate]).fit
+        evidence.append(posterior_draws(own, fit).log_evidence + candidate.contacts * math.log(ONE_MORE))
+    by_hand = torch.softmax(torch.stack(evidence, -1), -1)
+    p = found.evidence.probability
+    assert p is not None and torch.allclose(p, by_hand, atol=0.02)
+    assert torch.equal(found.evidence.choice, by_hand.argmax(-1))
+    assert found.evidence.something is not None and torch.allclose(found.evidence.something, p[:, 1])
+    assert int(((p[:, 1] > 0.1) & (p[:, 1] < 0.9)).sum()) >= 2  # of some it is open
+
+
+def test_a_resultant_holds_what_was_merged():
+    """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of the resultants of these."""
+    problem, truth = posed(40, 2, (0.5, 2.0), gap=0.06 * L)
+    found = analyze(problem, contact_hypotheses(problem), sampled=True)
+    assert found.intervals is not None and found.evidence is not None and found.evidence.probability is not None
+    interval = found.intervals.resultant[:, 3]
+    size = truth.norm(dim=-1)
+    inside = (size >= interval[:, 0]) & (size <= interval[:, 1])
+    merged = found.evidence.choice < 2
+    assert int(merged.sum()) >= 5
+    assert float(inside.double().mean()) > 0.85 and float(inside[merged].double().mean()) > 0.75
+
+
+def test_close_explanations_are_told(tmp_path, capsys):
+    """In the message, and with probabilities in RESULT.json; bands and resultants are there."""
+    problem, _ = posed(8, 3, (0.3, 0.6), gap=0.03)
+    rows = ["sample,s,x,y,z"]
+    markers = problem.markers
+    assert markers is not None
+    for b, points in enumerate(markers.positions.tolist()):
+        rows += [f"{b},{s},{x},{y},{z}" for s, (x, y, z) in zip(S.tolist(), points, strict=True)]
+    (tmp_path / "shapes.csv").write_text("\n".join(rows))
+    (tmp_path / "rod.toml").write_text(
+        f"[rod]\nlength = 0.4\nK_se = [2.5e5, 2.5e5, 6.5e5]\nK_bt = {problem.robot.rod.K_bt.diagonal().tolist()}\n"
+    )
+    given = [str(tmp_path / "rod.toml"), str(tmp_path / "shapes.csv")]
+    out = tmp_path / "result.json"
+    assert not main(["estimate", *given, "--noise", str(NOISE), "--contacts", "auto", "--load-prior", "auto", "--out", str(out)])
+    records = json.loads(out.read_text())["results"]
+    told = [r for r in records if "nearly alike" in r["message"]]
+    assert told and all(0.1 <= sorted(r["evidence"]["probability"].values())[-2] <= 0.5 for r in told)
+    for record in records:
+        shares = record["evidence"]["probability"]
+        assert math.isclose(sum(shares.values()), 1.0, abs_tol=1e-9)
+        assert max(shares, key=shares.get) == record["evidence"]["chosen"]
+        assert record["evidence"]["probability_of_any_load"] > 0.99
+        assert record["resultant"]["interval_95"]["magnitude_N"][0] > 0
+    assert "nearly alike" in capsys.readouterr().out

@@ -1,0 +1,144 @@
+"""What is known whatever the hypothesis: their probabilities, and resultants and bands averaged by them.
+
+The marginal likelihood of a hypothesis is the mean weight of the draws of its posterior (estimation.draws), with priors that are
+normalized. Probabilities p_h are in its proportion, times ONE_MORE for each load. Loads are reported of the
+likeliest one; the resultant, and f(s) along the rod, which all of them have, of draws of all of them, each weighted by p_h. Source:
+Hoeting et al., Statistical Science 14 (1999) 382.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..estimation.draws import Draws, picked, posterior_draws, systematic
+from ..estimation.intervals import CHUNK, Collected, Intervals, intervals, quantiles, resultant
+from ..estimation.load_profile import DRAWS as OF_BAND
+from ..estimation.load_profile import NODES, densities
+from ..estimation.result import Estimate
+from ..model.problem import Problem
+from ..util.precision import DTYPE
+from .count import Bar, Evidence, Hypothesis, Selection, no_bar
+
+ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
+RUNNING = 12.0  # of BIC: a hypothesis that is behind by more is out, by e^-6
+NEGLIGIBLE = 0.005  # of the probability: all other hypotheses together
+TRUSTED = 1.0  # of k-hat: draws whose weights are worse tell no evidence
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """The selection by evidence: the fit of the likeliest hypothesis of each sample, evidence with probabilities, and intervals."""
+
+    fit: Estimate
+    evidence: Evidence
+    intervals: Intervals
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Draws by hypothesis h of some samples of a chunk."""
+
+    h: int
+    rows: Int[Tensor, " b"]
+    fit: Estimate
+    draws: Draws
+
+
+def average(
+    problem: Problem, candidates: Sequence[Hypothesis], found: Selection, nu: float = math.inf, bar: Bar = no_bar
+) -> Averaged:
+    """Probabilities of the hypotheses that the BIC leaves in the running, and what is averaged by them.
+
+    nu: degrees of freedom of Student's t of a robust fit. bar: shows progress.
+    """
+    problems = [problem.of(c.unknowns) for c in candidates]
+    scores, best = found.evidence.bic, found.evidence.bic.nan_to_num(torch.inf, torch.inf).amin(-1, keepdim=True)
+    running = (scores <= best + RUNNING) & torch.isfinite(scores)
+    running.scatter_(1, found.evidence.choice.unsqueeze(-1), True)
+    probability = torch.full_like(scores, torch.nan)
+    rarer = math.log(ONE_MORE) * torch.tensor(
+        [c.contacts + (own.state.tip.size > 0) for c, own in zip(candidates, problems, strict=True)]
+    )
+    fit, choice = found.fit, found.evidence.choice.clone()
+    collected = Collected(fit)
+    with bar(problem.batch, "draws") as shown:
+        for chunk in torch.arange(problem.batch).split(CHUNK):
+            drawn = [d for h, own in enumerate(problems) for d in _drawn(own, h, found, chunk, running[chunk, h], nu)]
+            probability[chunk] = _probabilities(drawn, scores[chunk], rarer)
+            for d in drawn:
+                at = chunk[d.rows]
+                better = (probability[at].argmax(-1) == d.h) & (choice[at] != d.h) & (d.fit.accepted | ~fit.accepted[at])
+                fit = fit.merged(d.fit, at, better)
+                choice[at[better]] = d.h
+            for d in drawn:
+                chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
+                if len(chosen):
+                    collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen)))
+            _mix(collected, chunk, drawn, probability[chunk])
+            shown.update(len(chunk))
+    evidence = replace(found.evidence, choice=choice, probability=probability)
+    return Averaged(fit, evidence, collected.whole(fit))
+
+
+def _drawn(
+    own: Problem, h: int, found: Selection, chunk: Int[Tensor, " c"], running: Bool[Tensor, " c"], nu: float
+) -> list[_Drawn]:
+    """Draws by hypothesis h of those samples of a chunk for which it is in the running: of the chosen fit, and of the others."""
+    chosen, drawn = found.evidence.choice[chunk] == h, []
+    sources = [(running & chosen, found.fit, chunk)]
+    if h in found.fits:
+        other, index = found.fits[h]
+        place = torch.full((len(found.evidence.choice),), -1).index_copy(0, index, torch.arange(len(index)))[chunk]
+        sources.append((running & ~chosen & (place >= 0), other, place))
+    for wanted, fit, place in sources:
+        rows = wanted.nonzero().squeeze(-1)
+        if len(rows):
+            part = fit.of(place[rows], own.size)
+            drawn.append(_Drawn(h, rows, part, posterior_draws(own.take(chunk[rows]), part, nu=nu)))
+    return drawn
+
+
+def _probabilities(drawn: list[_Drawn], scores: Float[Tensor, "c H"], rarer: Float[Tensor, " H"]) -> Float[Tensor, "c H"]:
+    """By the evidence, each further load being rarer; of a sample with draws that are not to be trusted by the BIC."""
+    log_evidence = torch.full_like(scores, -torch.inf)
+    for d in drawn:
+        sound = (d.draws.k_hat <= TRUSTED) & torch.isfinite(d.draws.log_evidence)
+        log_evidence[d.rows, d.h] = torch.where(sound, d.draws.log_evidence, torch.nan)
+    doubtful = log_evidence.isnan().any(-1, keepdim=True)
+    by_bic = torch.where(log_evidence == -torch.inf, -torch.inf, -0.5 * scores.nan_to_num(torch.inf, torch.inf))
+    return torch.softmax(torch.where(doubtful, by_bic, log_evidence + rarer), -1)
+
+
+def _mix(collected: Collected, chunk: Int[Tensor, " c"], drawn: list[_Drawn], probability: Float[Tensor, "c H"]) -> None:
+    """Resultants and bands of draws of all hypotheses, of the samples that have several."""
+    several = (probability.amax(-1) < 1 - NEGLIGIBLE).nonzero().squeeze(-1)
+    band, whole = collected.values["band"], collected.values["resultant"]
+    if not len(several) or whole is None:
+        return
+    values, weights, profiles = [], [], []
+    for d in drawn:
+        own = torch.full((len(chunk),), -1).index_copy(0, d.rows, torch.arange(len(d.rows)))[several]
+        there, rows = own >= 0, own.clamp(min=0)
+        x, weight = d.draws.x[rows], d.draws.weight[rows].nan_to_num(0.0)
+        weight = torch.where(there.unsqueeze(-1), weight * probability[several, d.h].unsqueeze(-1), 0.0)
+        R = resultant(d.draws.problem, x).nan_to_num(0.0)
+        values.append(torch.cat([R, R.norm(dim=-1, keepdim=True)], -1))
+        weights.append(weight)
+        state, family = d.draws.problem.state, d.draws.problem.unknowns.loads
+        gamma = picked(x[..., state.loads.at].nan_to_num(0.0), systematic(weight + 1e-300, OF_BAND))
+        s = torch.linspace(0.0, d.draws.problem.robot.rod.length, NODES, dtype=DTYPE)
+        profiles.append((densities(family, gamma, s), weight.sum(-1, keepdim=True) / OF_BAND))
+    total = torch.cat(weights, 1)
+    sound = (total.sum(-1) > 0)[:, None, None]
+    at = chunk[several]
+    whole[at] = torch.where(sound, quantiles(torch.cat(values, 1), total / total.sum(-1, keepdim=True)), whole[at])
+    if band is None or any(f is None for f, _ in profiles):
+        return
+    f = torch.cat([f for f, _ in profiles if f is not None], -1).double().flatten(1, 2)
+    share = torch.cat([w.expand(-1, OF_BAND) for _, w in profiles], -1)
+    mixed = quantiles(f.transpose(1, 2), share / share.sum(-1, keepdim=True)).unflatten(1, (3, NODES)).transpose(1, 2)
+    band[at] = torch.where(sound.unsqueeze(-1), mixed, band[at])
