@@ -5,7 +5,7 @@ import math
 
 import torch
 
-from tests.robots import steel_rod
+from tests.robots import T, steel_rod
 from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Unknowns, analyze, contact_hypotheses, solve_shape
 from torchrod.analysis.averaging import ONE_MORE, average
 from torchrod.analysis.count import selection
@@ -88,3 +88,25 @@ def test_close_explanations_are_told(tmp_path, capsys):
         assert record["evidence"]["probability_of_any_load"] > 0.99
         assert record["resultant"]["interval_95"]["magnitude_N"][0] > 0
     assert "nearly alike" in capsys.readouterr().out
+
+
+def test_a_band_of_any_form_holds_a_uniform_load():
+    """Over 30 or 60 % of the rod, of 400 point forces; a Gaussian's band holds a quarter of it."""
+    random, robot, B, M = torch.Generator().manual_seed(4), steel_rod(), 16, 400
+    s = (torch.arange(M, dtype=DTYPE) + 0.5) / M
+    first, length = 0.1 + 0.3 * torch.rand(B, 1, generator=random, dtype=DTYPE), T([0.3, 0.6]).repeat(B // 2).unsqueeze(-1)
+    f = ((s > first) & (s < first + length)).to(DTYPE) / length  # of 1 N, per length
+    forces = torch.stack([f / M, 0 * f, 0 * f], -1)
+    p = solve_shape(robot, (PointForces(forces, (L * s).expand(B, -1)),), None, S, B, 40).p
+    p = p + 2e-4 * torch.randn(p.shape, generator=random, dtype=DTYPE)
+    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale)), [Markers(S, p, 2e-4)])
+    held = {}
+    for prior in ("smooth", "distributed"):
+        found = analyze(problem, contact_hypotheses(problem, 1, prior), sampled=True)
+        profile = found.profile
+        assert profile is not None and found.estimate.accepted.all()
+        at = profile.s / L
+        truth = ((at > first) & (at < first + length)).to(DTYPE) / length / L
+        inside = (truth >= profile.band[..., 2, 0]) & (truth <= profile.band[..., 2, 1])
+        held[prior] = float(inside[truth > 0].double().mean())
+    assert held["distributed"] < 0.6 < 0.9 < held["smooth"]

@@ -20,6 +20,7 @@ from torchrod import (
     Registration,
     Robot,
     Rod,
+    SmoothCoordinates,
     forward_jacobian,
     kernel,
     shape_from_base,
@@ -47,7 +48,7 @@ def close(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 @needs_compiler
 @pytest.mark.parametrize("registration", [None, Registration()], ids=["", "registration"])
-@pytest.mark.parametrize("loads", ["one gaussian", "three gaussians", "fourier"])
+@pytest.mark.parametrize("loads", ["one gaussian", "three gaussians", "fourier", "smooth"])
 @pytest.mark.parametrize("kind", ["passive", "tendons and gravity", "full stiffness"])
 def test_values_and_jacobians(kind, loads, registration):
     """Problem.linearized, which marches in the kernel, against forward_jacobian of the torch model."""
@@ -57,6 +58,7 @@ def test_values_and_jacobians(kind, loads, registration):
         "one gaussian": GaussianCoordinates(1, 0.4, scale),
         "three gaussians": GaussianCoordinates(3, 0.4, scale),
         "fourier": FourierCoordinates(3, 0.4, scale),
+        "smooth": SmoothCoordinates(0.4, scale, 2.0, 0.2, terms=5),
     }[loads]
     s, tension, offsets = T([0.1, 0.25, 0.4]), TENSION if len(robot.tendons) else None, 0.01 * torch.eye(3)
     problem = posed(s, torch.zeros(3, 3, 3), 1e-3, robot, family, tension, offsets, steps=10, registration=registration)

@@ -71,6 +71,7 @@ from .model.load_families import FourierCoordinates as FourierCoordinates
 from .model.load_families import GaussianCoordinates as GaussianCoordinates
 from .model.load_families import PaperCoordinates as PaperCoordinates
 from .model.load_families import PointCoordinates as PointCoordinates
+from .model.load_families import SmoothCoordinates as SmoothCoordinates
 from .model.problem import Problem as Problem
 from .model.sensors import BaseWrench as BaseWrench
 from .model.sensors import Camera as Camera

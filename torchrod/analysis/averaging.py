@@ -24,6 +24,7 @@ from ..util.precision import DTYPE
 from .count import Bar, Evidence, Hypothesis, Selection, no_bar
 
 ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
+OF_ANY_FORM = 0.0  # loads that a smooth one counts as: there are more forms of a distributed load than one
 RUNNING = 12.0  # of BIC: a hypothesis that is behind by more is out, by e^-6
 NEGLIGIBLE = 0.005  # of the probability: all other hypotheses together
 TRUSTED = 1.0  # of k-hat: draws whose weights are worse tell no evidence
@@ -56,13 +57,16 @@ def average(
     nu: degrees of freedom of Student's t of a robust fit. bar: shows progress.
     """
     problems = [problem.of(c.unknowns) for c in candidates]
-    scores, best = found.evidence.bic, found.evidence.bic.nan_to_num(torch.inf, torch.inf).amin(-1, keepdim=True)
-    running = (scores <= best + RUNNING) & torch.isfinite(scores)
+    scores = found.evidence.bic
+    held = torch.tensor([own.state.loads.size > 0 and own.state.loads.informative == own.state.loads.size for own in problems])
+    running = _running(scores, ~held) | _running(scores, held)
     running.scatter_(1, found.evidence.choice.unsqueeze(-1), True)
     probability = torch.full_like(scores, torch.nan)
-    rarer = math.log(ONE_MORE) * torch.tensor(
-        [c.contacts + (own.state.tip.size > 0) for c, own in zip(candidates, problems, strict=True)]
-    )
+    more = [
+        (OF_ANY_FORM if h else c.contacts) + (own.state.tip.size > 0)
+        for h, c, own in zip(held.tolist(), candidates, problems, strict=True)
+    ]
+    rarer = math.log(ONE_MORE) * torch.tensor(more)
     fit, choice = found.fit, found.evidence.choice.clone()
     collected = Collected(fit)
     with bar(problem.batch, "draws") as shown:
@@ -82,6 +86,12 @@ def average(
             shown.update(len(chunk))
     evidence = replace(found.evidence, choice=choice, probability=probability)
     return Averaged(fit, evidence, collected.whole(fit))
+
+
+def _running(scores: Float[Tensor, "B H"], kind: Bool[Tensor, " H"]) -> Bool[Tensor, "B H"]:
+    """Of the hypotheses of a kind those near the best of them: what priors hold altogether has a BIC on a scale of its own."""
+    known = torch.where(kind & torch.isfinite(scores), scores, torch.inf)
+    return (known <= known.amin(-1, keepdim=True) + RUNNING) & torch.isfinite(known)
 
 
 def _drawn(

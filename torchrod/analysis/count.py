@@ -80,14 +80,16 @@ class Evidence:
         """A sentence on another explanation that is nearly as probable as the one that was chosen; "" where there is none."""
         if self.probability is None:
             return ""
-        share = self.probability[sample].nan_to_num(0.0)
-        chosen, rest = int(self.choice[sample]), share.index_fill(0, self.choice[sample], 0.0)
-        best = int(rest.argmax())
-        if float(rest[best]) < CLOSE:
+        shares: dict[str, float] = {}  # smooth loads of all sizes and length scales, which stand in brackets, together
+        for name, share in zip(self.names, self.probability[sample].nan_to_num(0.0).tolist(), strict=True):
+            kind = name.partition("(")[0]
+            shares[kind] = shares.get(kind, 0.0) + share
+        chosen = self.names[int(self.choice[sample])].partition("(")[0]
+        rest = {name: share for name, share in shares.items() if name != chosen}
+        best = max(rest, key=lambda name: rest[name], default=chosen)
+        if best == chosen or rest[best] < CLOSE:
             return ""
-        both = (
-            f"{self.names[chosen]} ({100 * float(share[chosen]):.0f} %) and {self.names[best]} ({100 * float(share[best]):.0f} %)"
-        )
+        both = f"{chosen} ({100 * shares[chosen]:.0f} %) and {best} ({100 * rest[best]:.0f} %)"
         return f"Among the numbers and kinds of loads, {both} explain the readings nearly alike."
 
 
@@ -113,8 +115,15 @@ def bic(problem: Problem, fit: Estimate) -> Float[Tensor, " B"]:
     """chi^2 + k ln(n): k load parameters that no prior holds, n numbers read; inf where not converged.
 
     Source: Schwarz 1978, for Gaussian noise of known size. A width with a prior is paid for in chi^2, which contains the prior.
+    Loads that priors hold altogether pay for what they narrow down, by Laplace's method: log det (posterior precision / prior
+    precision).
     """
     value = fit.cost + free_parameters(problem) * torch.log(problem.seen.to(fit.cost.dtype).clamp(min=math.e))
+    loads = problem.state.loads
+    if loads.size and loads.informative == loads.size:
+        root = loads.precision.sqrt()
+        narrowed = root.unsqueeze(-1) * fit.covariance[:, loads.at, loads.at] * root
+        value = value - torch.linalg.slogdet(narrowed)[1]
     return torch.where((fit.status == int(Status.CONVERGED)) & torch.isfinite(value), value, torch.inf)
 
 
@@ -316,8 +325,7 @@ def _needed(
     asked = per_load * torch.log(before.seen.to(fitted.cost.dtype).clamp(min=math.e))
     foreseen[index] = bic(before, fitted) - found.drop + asked
     rows = (sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)).nonzero().squeeze(-1)
-    begin = start_with_one_more(own.unknowns, found.take(rows))
-    return index[rows], begin if contacts > 1 else rule
+    return index[rows], start_with_one_more(own.unknowns, found.take(rows)) if contacts > 1 else rule
 
 
 def same_kind(a: Unknowns, b: Unknowns) -> bool:

@@ -1,5 +1,6 @@
 """The whole way from readings to an answer: noise, number of loads, common frame, judgement, diagnosis, load profile."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +17,7 @@ from ..estimation.shared import STEPS, BaseFrame, with_shared_frame
 from ..estimation.solve import Settings, estimate_each
 from ..estimation.starts import StartRule, cold_start
 from ..learned.warm_start import find_warm_start
-from ..model.load_families import GaussianCoordinates
+from ..model.load_families import GaussianCoordinates, SmoothCoordinates
 from ..model.problem import Problem
 from ..model.sensors import TipWrench
 from ..model.unknowns import Scope, Unknowns
@@ -27,6 +28,7 @@ from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
 from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_intervals, joined_noise, part_of, patterns
 
+SMOOTH_DEVIATIONS, SMOOTH_CORRELATIONS = (0.5, 2.0, 8.0), (0.1, 0.4)  # force scales / L, lengths
 MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
 
 
@@ -44,30 +46,38 @@ def contact_hypotheses(
 ) -> list[Hypothesis]:
     """What competes to explain the readings of a problem: numbers of Gaussian loads, priors of their width, something at the tip.
 
-    contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", or "auto": contact
-    against distributed. locations: known ones (m), one for each contact. friction: of contacts that may drag along the rod
+    contacts: so many, or "auto": 0 to MAX_CONTACTS. load_prior: "point", "contact", "distributed", "none", "smooth": one load of
+    any form along the rod, of several sizes and length scales (model.load_families.smooth), or "auto": contact against distributed
+    and smooth. locations: known ones (m), one for each contact. friction: of contacts that may drag along the rod
     (GaussianCoordinates); infinite: by any force; None: by none. With contacts "auto" an unknown tip of the problem's unknowns
     competes with nothing at the tip, unless a sensor reads it; where none is unknown, a force there is tried on samples that take
     two contacts or that nothing explains. The rest of its unknowns is part of every hypothesis. Errors: ValueError for another
     prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
+    if load_prior == "smooth" and not (contacts in (1, "auto", "1") and locations is None and friction is None):
+        raise ValueError('load_prior "smooth" is one load along the whole rod; leave contacts, places and friction out')
     counts = range(MAX_CONTACTS + 1) if contacts == "auto" else [int(contacts)]
-    priors = ["contact", "distributed"] if load_prior == "auto" else [load_prior]
+    priors = {"auto": ["contact", "distributed"], "smooth": []}.get(load_prior, [load_prior])
     competes = contacts == "auto" and known.tip != "none" and not any(isinstance(s, TipWrench) for s in problem.sensors)
     tips = ["none", known.tip] if competes else [known.tip]
     at = None if locations is None else tuple(locations)
     found = []
     for k in counts:
         for tip in tips:
-            for prior in priors if k else priors[:1]:
+            for prior in priors if k else ["contact"]:
                 name = f"{k} {prior}" if len(priors) > 1 and k else str(k)
                 name += f" + tip {tip}" if len(tips) > 1 and tip != "none" else ""
                 loads = GaussianCoordinates(k, rod.length, rod.force_scale, prior, at, friction=friction)
                 found.append(Hypothesis(name, k, replace(known, loads=loads, tip=tip)))
+            if k == 1 and load_prior in ("auto", "smooth") and locations is None and friction is None:
+                for scales in itertools.product(SMOOTH_DEVIATIONS, SMOOTH_CORRELATIONS):
+                    smooth = SmoothCoordinates(rod.length, rod.force_scale, *scales)
+                    name = f"1 {smooth.prior_name}" + f" + tip {tip}" * (len(tips) > 1 and tip != "none")
+                    found.append(Hypothesis(name, 1, replace(known, loads=smooth, tip=tip)))
     if contacts == "auto" and known.tip == "none":
         for k in range(MOST_BESIDE_TIP + 1):
-            loads = GaussianCoordinates(k, rod.length, rod.force_scale, priors[0], at, friction=friction)
+            loads = GaussianCoordinates(k, rod.length, rod.force_scale, (priors or ["contact"])[0], at, friction=friction)
             found.append(Hypothesis(f"{k} + tip force", k, replace(known, loads=loads, tip="force"), spare=True))
     return found
 

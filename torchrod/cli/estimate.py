@@ -29,7 +29,7 @@ from ..io import (
 from ..learned.features import features
 from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
-from ..model.load_families import GaussianCoordinates
+from ..model.load_families import GaussianCoordinates, SmoothCoordinates
 from ..model.problem import FINEST, Problem
 from ..model.unknowns import Registration, Scope, Unknowns
 from ..util.errors import InputError
@@ -202,10 +202,16 @@ def estimate(options: Namespace) -> None:
     _warn_of_idle(options, robot, shapes)
     problem = _problem(options, robot, known, shapes, noise)
     count, at = _count(options, robot), options.location or None
+    if options.load_prior == "smooth" and (count not in (1, "auto") or at or _friction(options) is not None):
+        raise InputError(
+            "--load-prior smooth is one load along the whole rod; leave out --contacts, --location, --contact-friction and --axial"
+        )
     candidates = contact_hypotheses(problem, count, options.load_prior, at, _friction(options))
     _check_enough(options, problem.of(next((c for c in candidates if c.contacts), candidates[0]).unknowns))
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     sampled = _sampled(options, problem, len(candidates) > 1)
+    if options.load_prior == "auto" and not sampled:  # which only draws can weigh against the others
+        candidates = [c for c in candidates if not isinstance(c.unknowns.loads, SmoothCoordinates)]
     try:
         found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar, sampled)
     except InputError:  # names its own file

@@ -71,9 +71,10 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument(
         "--load-prior",
         type=str,
-        choices=["point", "contact", "distributed", "none", "auto"],
+        choices=["point", "contact", "distributed", "smooth", "none", "auto"],
         default="contact",
-        help="what is known of the width; auto: contact or distributed, as the data ask for",
+        help="what is known of the width; smooth: one load of any form along the rod; auto: contact, distributed or smooth, as the "
+        "data ask for",
     )
     drag = "friction of the contacts: each may drag along the rod by 0 +- MU times its force"
     parser.add_argument("--contact-friction", type=float, default=None, metavar="MU", help=drag)

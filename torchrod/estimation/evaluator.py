@@ -21,7 +21,7 @@ from ..mechanics.integrate import known
 from ..mechanics.loads import total
 from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
-from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates
+from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates, SmoothCoordinates
 from ..model.load_families.family import FAINT
 from ..model.problem import TIP_ROWS, Problem
 from ..model.uncertainty import Warp, parabola
@@ -139,7 +139,7 @@ def family_of(problem: Problem) -> str | None:
         return "none"
     if isinstance(c, GaussianCoordinates | PaperCoordinates):
         return "gaussian" if isinstance(c, GaussianCoordinates) else "paper"
-    if isinstance(c, FourierCoordinates) or (isinstance(c, PointCoordinates) and c.locations is not None):
+    if isinstance(c, FourierCoordinates | SmoothCoordinates) or (isinstance(c, PointCoordinates) and c.locations is not None):
         return "linear"
     return "point" if isinstance(c, PointCoordinates) else None
 

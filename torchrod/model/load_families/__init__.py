@@ -9,6 +9,7 @@ from .fourier import FourierCoordinates
 from .gaussian import WIDTH_OF_PRIOR, GaussianCoordinates
 from .paper import PaperCoordinates
 from .point import PointCoordinates
+from .smooth import SmoothCoordinates
 
 __all__ = [
     "WIDTH_OF_PRIOR",
@@ -19,4 +20,5 @@ __all__ = [
     "LoadReport",
     "PaperCoordinates",
     "PointCoordinates",
+    "SmoothCoordinates",
 ]

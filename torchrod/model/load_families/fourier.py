@@ -52,8 +52,12 @@ class FourierCoordinates:
 
     def describe(self, gamma: Gamma) -> LoadReport:
         """The whole series as one load: its net force, its centroid (by |f|) and the spread about it."""
-        (load,) = self.loads(gamma)
-        s = torch.linspace(0.0, self.length, 201, dtype=DTYPE)
+        return self.as_one(self.loads(gamma)[0], self.length)
+
+    @staticmethod
+    def as_one(load: Load, length: float) -> LoadReport:
+        """A distributed load as one, from 201 places along the rod."""
+        s = torch.linspace(0.0, length, 201, dtype=DTYPE)
         density = load.density(s)
         assert density is not None
         weight = density.square().sum(-1).clamp(min=1e-300).sqrt()
