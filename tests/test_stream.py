@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from tests.robots import T, busy_robot, steel_rod
-from torchrod import GaussianCoordinates, PointForces, Status, Tracker, Unknowns, cold_start, solve_shape
+from torchrod import GaussianCoordinates, Origin, PointForces, Status, Tracker, Unknowns, cold_start, solve_shape
 from torchrod.analysis import tracker as tracker_module
-from torchrod.estimation.starts import Origin
 from torchrod.util.threads import kernel_threads, one_thread
 
 FRAMES = 25
