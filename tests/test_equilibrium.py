@@ -49,7 +49,10 @@ KINDS = ("one gaussian", "two gaussians", "the paper's", "point")
 WAYS = [pytest.param(robot, kind, True, marks=needs_compiler, id=f"{robot}-{kind}-kernel") for robot in ROBOTS for kind in KINDS]
 # Without the kernel every kind of load goes the same way, which is slow: one of them for two robots.
 WAYS += [
-    pytest.param(robot, "one gaussian", False, id=f"{robot}-one gaussian-torch") for robot in ("passive", "tendons and gravity")
+    pytest.param("passive", "one gaussian", False, id="passive-one gaussian-torch"),
+    pytest.param(
+        "tendons and gravity", "one gaussian", False, marks=pytest.mark.study, id="tendons and gravity-one gaussian-torch"
+    ),
 ]
 
 

@@ -286,7 +286,10 @@ def fits(problem: Problem, settings: Settings | None = None):
     return estimate(problem, settings, cold_start)
 
 
-@pytest.mark.parametrize("kind", ["one contact", "two contacts", "tendons", "registration", "points"])
+@pytest.mark.parametrize(
+    "kind",
+    ["two contacts", "registration", *(pytest.param(k, marks=pytest.mark.study) for k in ("one contact", "tendons", "points"))],
+)
 def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     """Loads to 1e-8 relative, status and iterations the same."""
     robot, s = (busy_robot() if kind == "tendons" else steel_rod()), torch.linspace(0.05, 0.4, 8)
