@@ -7,6 +7,7 @@ import torch
 
 from tests.robots import T, busy_robot
 from torchrod import PointForces, Robot, Rod, Tendon, Tendons, reference_lengths, solve_displacement, solve_shape
+from torchrod.mechanics.actuation import _secant
 
 S = torch.linspace(0.05, 0.4, 8, dtype=torch.float64)
 
@@ -97,3 +98,14 @@ def test_the_pair_that_was_refused():
     answer = solve_displacement(robot, (), T([[0.012, 0.012, -0.012, -0.012]]), T([0.5]))
     assert (answer.tension[0] - T([15.989, 16.626, 0.0, 0.0])).abs().max() < 1e-3
     assert (answer.equilibrium.p[0, 0] - T([0.18257, 0.17780, 0.39985])).abs().max() < 1e-5
+
+
+def test_a_secant_slope_foretells_the_last_change_and_nothing_else():
+    g = torch.Generator().manual_seed(0)
+    slope, step, change, other = (torch.randn(4, *shape, generator=g) for shape in ((3, 3), (3,), (3,), (3,)))
+    step[3] = 0.0
+    across = other - step * (other * step).sum(-1, keepdim=True) / step.square().sum(-1, keepdim=True).clamp(min=1e-30)
+    found = _secant(slope, step, change)
+    assert torch.allclose((found @ step.unsqueeze(-1)).squeeze(-1)[:3], change[:3])
+    assert torch.allclose(found @ across.unsqueeze(-1), slope @ across.unsqueeze(-1))
+    assert torch.equal(found[3], slope[3]), "no step says nothing"

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.discs import disc_by_disc
+from tests.problems import slopes
 from torchrod import (
     GaussianCoordinates,
     Markers,
@@ -107,7 +108,7 @@ def test_kernel_and_derivatives():
     g = torch.Generator().manual_seed(2)
     markers = Markers(torch.tensor([0.1, 0.2, 0.27]), 0.1 * torch.randn(3, 3, 3, generator=g), 1e-3, 0.01 * torch.eye(3))
     tension = torch.tensor([[2.0, 1.0, 0.5], [4.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale), tension_std=0.3), [markers], tension, 10)
+    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale), tension_std=0.3), [markers], tension, 4)
     x = 0.3 * torch.randn(3, problem.size, generator=g)
     assert isinstance(evaluator(problem), KernelEvaluator)
     _, H = forward_jacobian(problem.h, x)
@@ -115,10 +116,8 @@ def test_kernel_and_derivatives():
     for name in ("A", "g", "cost", "r", "C"):
         a, b = getattr(found, name), getattr(plain, name)
         assert (a - b).abs().max() < 1e-10 * b.abs().max(), name
-    step = 1e-6 * torch.eye(problem.size)
-    for k in (0, 2, 4, 5, 8, 10):
-        slope = (problem.h(x + step[k]) - problem.h(x - step[k])) / 2e-6
-        assert torch.allclose(slope, H[..., k], rtol=1e-5, atol=1e-6 * float(H[..., k].abs().max()))
+    for slope, column in zip(slopes(problem, x).unbind(-1), H.unbind(-1), strict=True):
+        assert torch.allclose(slope, column, rtol=1e-5, atol=1e-6 * float(column.abs().max()))
 
 
 def test_a_push_on_a_robot_with_discs():

@@ -61,7 +61,7 @@ def test_values_and_jacobians(kind, loads, registration):
         "smooth": SmoothCoordinates(0.4, scale, 2.0, 0.2, terms=5),
     }[loads]
     s, tension, offsets = T([0.1, 0.25, 0.4]), TENSION if len(robot.tendons) else None, 0.01 * torch.eye(3)
-    problem = posed(s, torch.zeros(3, 3, 3), 1e-3, robot, family, tension, offsets, steps=10, registration=registration)
+    problem = posed(s, torch.zeros(3, 3, 3), 1e-3, robot, family, tension, offsets, steps=5, registration=registration)
     start = problem.state.join(family.start().expand(3, -1), torch.zeros(3, 6))
     x = start + 0.3 * torch.randn(3, problem.size, generator=torch.Generator().manual_seed(1))
     h, H = problem.linearized(x)
@@ -79,7 +79,7 @@ def test_the_forward_solve(monkeypatch):
     points = PointForces(T([[[0.3, 0.1, 0.0]], [[0.2, 0.4, 0.0]], [[0.0, 0.1, 0.0]]]), T([[0.11], [0.29], [0.4]]))
 
     def solve():
-        return solve_shape(robot, (local, dead, points), TENSION, s, 3, 10)
+        return solve_shape(robot, (local, dead, points), TENSION, s, 3, 5)
 
     compiled = solve()
     monkeypatch.setattr(kernel, "available", lambda: False)
@@ -127,7 +127,7 @@ from torchrod import Robot, Rod, solve_shape
 robot = Robot(Rod.circular(0.4, 0.0014, 207e9, 79e9, 0.05), gravity=torch.tensor([9.81, 0.0, 0.0], dtype=torch.float64))
 with warnings.catch_warnings(record=True) as seen:
     for _ in range(2):
-        shape = solve_shape(robot, (), None, torch.tensor([0.4], dtype=torch.float64), 1, 10)
+        shape = solve_shape(robot, (), None, torch.tensor([0.4], dtype=torch.float64), 1, 4)
 assert shape.status[0] == 0
 assert sum("no compiled kernel" in str(w.message) for w in seen) == 1, [str(w.message) for w in seen]
 """

@@ -33,7 +33,7 @@ def wrong(tmp_path_factory):
     return folder, *errata.run(True, folder)
 
 
-@pytest.mark.parametrize("part", ["two", "three", "wrong"])
+@pytest.mark.parametrize("part", ["two", *(pytest.param(p, marks=pytest.mark.study) for p in ("three", "wrong"))])
 @pytest.mark.many_fits
 def test_pictures_and_data(part, request):
     folder, data, lines = request.getfixturevalue(part)
@@ -72,6 +72,7 @@ def test_equation_7_is_the_derivative_of_equation_6():
     assert torch.allclose(1 / by_place, (delta(F, mu + h) - delta(F, mu - h)) / (2 * h), rtol=1e-8)
 
 
+@pytest.mark.study
 def test_the_papers_figure_4(three):
     """(8) meets (7) while the rod is straight, and exceeds it the more the larger the force; more points lower it."""
     tip = three[1]["tip"]
@@ -117,6 +118,7 @@ def test_jacobian_is_that_of_the_forward_solve():
         assert (J[..., k] - difference / (2 * h)).norm() < 1e-4 * J[..., k].norm()
 
 
+@pytest.mark.study
 def test_sensitivities(three):
     data = three[1]
     assert data["small_force_off"] < 0.01
@@ -145,6 +147,7 @@ def test_joint_sensitivity_is_the_row_norm_of_the_pseudo_inverse():
     assert (sensitivity.jointly(J) / rows - 1).abs().max() < 1e-9
 
 
+@pytest.mark.study
 def test_innovation_and_index(wrong):
     data = wrong[1]
     for part in ("innovation_linear", "innovation_paper", "innovation_scaled"):
@@ -157,6 +160,7 @@ def test_innovation_and_index(wrong):
     assert min(others) > 1e-2
 
 
+@pytest.mark.study
 def test_damping_and_actuation(wrong):
     data = wrong[1]
     rows = list(data["damping"].values())
@@ -171,6 +175,7 @@ def test_damping_and_actuation(wrong):
     assert abs(data["actuation"]["cm"]["bend_rad"] - 16.4) < 0.1
 
 
+@pytest.mark.study
 def test_counts_tip_and_sensitivity(wrong):
     data = wrong[1]
     assert data["counts"] == {"three_gaussians": 12, "gaussians_k_0_to_3": 16}
@@ -185,6 +190,7 @@ def test_counts_tip_and_sensitivity(wrong):
     assert abs(data["points"]["location_std_nine_m"] / data["points"]["location_std_eight_m"] - 1) < 1e-9
 
 
+@pytest.mark.study
 def test_the_means_of_the_printed_rows(wrong):
     """As PAPER's rows have them, and not as its text says of Tables I and II."""
     for table, (force, location) in {"I": (0.32, 1.98), "II": (0.61, 4.19), "III": (0.65, 3.98)}.items():

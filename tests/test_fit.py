@@ -68,14 +68,14 @@ def close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-10) -> bool:
     return bool((a - b).abs().max() <= relative * b.abs().max())
 
 
-def case(robot: Robot, family, noise: float = 1e-3, **unknown: Any) -> tuple[Problem, torch.Tensor]:
+def case(robot: Robot, family, noise: float = 1e-3, steps: int = 4, **unknown: Any) -> tuple[Problem, torch.Tensor]:
     """A problem and a state somewhere, with markers on stalks one of which is missing."""
     generator = torch.Generator().manual_seed(1)
     positions = 0.1 * torch.randn(B, 3, 3, generator=generator)
     positions[1, 1] = torch.nan
     tension = TENSION[torch.tensor([0, 1, 2, 0, 1]), : len(robot.tendons)] if len(robot.tendons) else None
     s, offsets = T([0.1, 0.25, 0.4]), 0.01 * torch.eye(3)
-    problem = posed(s, positions, noise, robot, family, tension, offsets, steps=10, **unknown)
+    problem = posed(s, positions, noise, robot, family, tension, offsets, steps=steps, **unknown)
     x = problem.state.join(family.start().expand(B, -1), torch.zeros(B, 6))
     size = torch.where(x.abs() > 100, 0.1 * x.abs(), 1.0)
     x = x + 0.3 * size * torch.randn(B, problem.size, generator=generator)
@@ -103,9 +103,15 @@ FRAMES = {
 }
 
 
-@pytest.mark.parametrize("frame", FRAMES)
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize("robot", ROBOTS)
+def combined() -> list[Any]:
+    """Every robot with every family and frame; a plain run has every family in the fullest frame, and every frame for one."""
+    every = [(r, f, k) for r in ROBOTS for f in FAMILIES for k in FRAMES]
+    quick = {"zeta, tip wrench, tensions": FAMILIES, "plain": ("one gaussian", "points"), "tensions": ("one gaussian",)}
+    quick["zeta, tip force"] = ("one gaussian",)
+    return [pytest.param(r, f, k, marks=() if f in quick[k] else pytest.mark.study, id=f"{r}-{f}-{k}") for r, f, k in every]
+
+
+@pytest.mark.parametrize(("robot", "family", "frame"), combined())
 def test_h_jacobian_and_normal_equations(robot, family, frame):
     r = ROBOTS[robot]()
     problem, x = case(r, FAMILIES[family](r.rod.force_scale), **FRAMES[frame])
@@ -181,7 +187,7 @@ def test_the_covariance():
 @pytest.mark.parametrize("exact", [False, True])
 def test_one_iteration_of_the_filter(exact):
     """kernel.iterate against ekf.advance, from states near and far from the data, one of which is not finite."""
-    problem, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), noise=0.1)
+    problem, x = case(steel_rod(), GaussianCoordinates(1, 0.4, 1.0), noise=0.1, steps=10)
     evaluate = KernelEvaluator(problem)
     scales = TIP_FORCE_STD * problem.robot.rod.force_scale, TIP_MOMENT_STD * problem.robot.rod.moment_scale
     fitted = estimate(problem if exact else replace(problem, tip_std=scales)).x
@@ -280,7 +286,10 @@ def fits(problem: Problem, settings: Settings | None = None):
     return estimate(problem, settings, cold_start)
 
 
-@pytest.mark.parametrize("kind", ["one contact", "two contacts", "tendons", "registration", "points"])
+@pytest.mark.parametrize(
+    "kind",
+    ["two contacts", "registration", *(pytest.param(k, marks=pytest.mark.study) for k in ("one contact", "tendons", "points"))],
+)
 def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     """Loads to 1e-8 relative, status and iterations the same."""
     robot, s = (busy_robot() if kind == "tendons" else steel_rod()), torch.linspace(0.05, 0.4, 8)
@@ -297,7 +306,7 @@ def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     points = kind == "points"
     family = PointCoordinates(n, 0.4, 1.0) if points else GaussianCoordinates(n, 0.4, 1.0)
     registration = Registration() if kind == "registration" else None
-    problem = posed(s, p, 1e-3, robot, family, tension, steps=20, registration=registration)
+    problem = posed(s, p, 1e-3, robot, family, tension, steps=8, registration=registration)
     compiled = fits(problem)
     monkeypatch.setattr(kernel, "available", lambda: False)
     plain = fits(problem)

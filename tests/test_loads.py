@@ -81,7 +81,7 @@ def test_gradcheck(name):
     robot, s = steel_rod(), T([0.1, 0.25, 0.4])
 
     def h(x):
-        shape = shape_from_base(robot, (families(x[..., :8])[name],), x[..., 8:] * T([1, 1, 1, 0.2, 0.2, 0.2]), None, s, 8)
+        shape = shape_from_base(robot, (families(x[..., :8])[name],), x[..., 8:] * T([1, 1, 1, 0.2, 0.2, 0.2]), None, s, 4)
         return torch.cat([shape.p.flatten(-2), shape.tip_residual], -1)
 
     x = T([[0.7, -0.4, 0.31, 0.2, 0.5, -0.6, 0.1, 0.4, 0.3, 0.2, 0.1, 0.3, -0.2, 0.1]]).requires_grad_()

@@ -81,6 +81,7 @@ def test_orientations_halve_the_spread_of_the_tip_force():
     assert (spread[1] < 0.5 * spread[0]).all(), spread
 
 
+@pytest.mark.study
 def test_the_intervals_hold_the_truth():
     """Pushes of 0.5 to 1 N seen by five sensors, 0.5 mm and 0.5 degrees: 95 % intervals of force and location, 300 cases."""
     generator = torch.Generator().manual_seed(5)

@@ -69,9 +69,11 @@ def test_the_printed_rows_are_those_of_the_shared_facts():
 @pytest.mark.many_fits
 @pytest.mark.study
 def test_quick_reproduction(tmp_path):
+    """The parts of fits; tests/test_figures.py runs the others."""
     command = [
         sys.executable,
         str(ROOT / "scripts" / "reproduce.py"),
+        *("study1", "study2", "coverage", "tables"),
         "--quick",
         "--json",
         str(tmp_path / "f.json"),

@@ -7,6 +7,7 @@ import pytest
 import torch
 from studies import sensors as study
 
+from tests.problems import slopes
 from tests.robots import T, busy_robot, steel_rod
 from torchrod import (
     BaseWrench,
@@ -107,10 +108,8 @@ def curve(problem: Problem, x: torch.Tensor) -> torch.Tensor:
 def check_rows(problem: Problem, x: torch.Tensor) -> None:
     """H against central differences of h, row by row, of what is read."""
     _, H = problem.linearized(x)
-    read, step = problem.weights > 0, 1e-6 * torch.eye(problem.size)
-    for k in range(problem.size):
-        up, down = (problem.h(x + sign * step[k], differentiable=False) for sign in (1, -1))
-        assert torch.allclose(((up - down) / 2e-6)[read], H[..., k][read], rtol=1e-6, atol=2e-6), k
+    read = problem.weights > 0
+    assert torch.allclose(slopes(problem, x, differentiable=False)[read], H[read], rtol=1e-6, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -263,11 +262,11 @@ def test_the_intervals_hold_the_truth(name):
 @pytest.mark.parametrize("name", study.CASES)
 def test_coverage(name):
     """A part of scripts/sensors.py, whose 500 pushes hold 93 to 97 %."""
-    found = study.coverage(study.CASES[name](), 120, 12)
+    found = study.coverage(study.CASES[name](), 80, 12)
     assert found.accepted > 0.97
     for _, over_bound, held in (found.force, found.place):
         assert 0.8 < over_bound < 1.2
-        assert held > 0.87, "95 % less four standard errors of so many pushes"
+        assert held > 0.85, "95 % less four standard errors of so many pushes"
 
 
 def test_arc_lengths_off_are_told_by_their_deviation_only():

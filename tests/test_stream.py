@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from tests.robots import T, busy_robot, steel_rod
-from torchrod import GaussianCoordinates, PointForces, Status, Tracker, Unknowns, solve_shape
+from torchrod import GaussianCoordinates, Origin, PointForces, Status, Tracker, Unknowns, cold_start, solve_shape
+from torchrod.analysis import tracker as tracker_module
 from torchrod.util.threads import kernel_threads, one_thread
 
 FRAMES = 25
@@ -50,6 +51,30 @@ def test_a_jump_is_followed_and_reset_forgets():
     tracker.reset()
     again = tracker(p[1])
     assert torch.allclose(again.force, fits[1].force, atol=1e-4)
+
+
+def test_a_refused_fit_is_no_start():
+    """A frame that no contact explains, and which is finite all the same, is forgotten."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    p = solve_shape(robot, (PointForces(T([[[0.6, 0.2, 0.0]]]), T([[0.3]])),), None, s, 1).p[0]
+    waved = p + 0.01 * torch.sin(40 * s).unsqueeze(-1)
+    tracker = Tracker(robot, Unknowns(GaussianCoordinates(1, 0.4, 1.0, "point")), s, 1e-3)
+    _, refused, after, onward = (tracker(each) for each in (p, waved, p, p))
+    assert int(refused.guess) == Origin.PREVIOUS
+    assert not refused.accepted and torch.isfinite(refused.x).all()
+    assert int(after.guess) != Origin.PREVIOUS
+    assert int(onward.guess) == Origin.PREVIOUS
+
+
+def test_the_last_fit_is_challenged_at_the_tensions_of_the_frame(monkeypatch):
+    robot, s, asked = busy_robot(), torch.linspace(0.02, 0.4, 20), []
+    monkeypatch.setattr(tracker_module, "cold_start", lambda problem: asked.append(problem.tension.tolist()) or cold_start(problem))
+    tension = T([[3.0, 2.0], [3.0, 2.0], [1.0, 4.0]])
+    p = solve_shape(robot, (PointForces(T([[[0.6, 0.2, 0.0]]]), T([[0.3]])),), tension, s, 3).p
+    tracker = Tracker(robot, Unknowns(GaussianCoordinates(1, 0.4, robot.rod.force_scale, "point")), s, 1e-3)
+    for k in range(3):
+        assert tracker(p[k], tension[k]).accepted
+    assert asked[-2:] == [[[3.0, 2.0]], [[1.0, 4.0]]]
 
 
 def test_a_few_samples_leave_torch_one_thread_and_the_kernel_all():

@@ -39,10 +39,11 @@ from torchrod import (
 )
 from torchrod.cli import main
 from torchrod.estimation.evaluator import evaluator
-from torchrod.estimation.starts import Fate
-from torchrod.learned.features import GRID, features, smoothed
+from torchrod.estimation.starts import Fate, challenged_by_cold
+from torchrod.learned.features import GRID, _facing, features, smoothed
 from torchrod.learned.network import digest, load_checkpoint, save_checkpoint
-from torchrod.learned.warm_start import shipped
+from torchrod.learned.warm_start import bounded, shipped
+from torchrod.mechanics.lie import rotate
 
 ROOT = Path(__file__).resolve().parents[1]
 ROD_1 = ROOT / "checkpoints" / "rod_1.safetensors"
@@ -221,6 +222,38 @@ def test_a_start_that_leads_nowhere_is_followed_by_a_cold_one():
     assert (fit.iterations[retried] > cold.iterations[retried]).all()
     assert torch.allclose(fit.force, cold.force, atol=0.02)
     assert "cold start" in fit.message(int(retried.nonzero()[0, 0]))
+
+
+def test_of_two_starts_without_a_cost_the_cold_one_is_taken():
+    markers, _ = noisy(2)
+    problem = seen(markers)
+    cold = cold_start(problem).x
+    guess = Start.at(cold + 0.1, Origin.LEARNED, challenged=True)
+    costs = T([[math.inf, math.nan], [1.0, 2.0]])
+    chosen, dropped = challenged_by_cold(problem, replace(guess, costs=costs), torch.eye(problem.size))
+    assert dropped.tolist() == [True, False]
+    assert torch.equal(chosen.x, torch.stack([cold[0], guess.x[1]]))
+    assert chosen.origin.tolist() == [int(Origin.COLD), int(Origin.LEARNED)]
+
+
+def test_the_tip_is_begun_facing_the_way_the_markers_go():
+    way = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    turned = rotate(_facing(way), T([0.0, 0.0, 1.0]).expand(20, 3))
+    assert torch.allclose(turned, torch.nn.functional.normalize(way, dim=-1), atol=1e-12)
+
+
+def test_a_predicted_spread_is_what_the_filter_begins_with():
+    """Of three contacts, whose network predicts it: wider than the network thinks, and bounded."""
+    markers, _ = noisy(3)
+    problem = Problem(steel_rod(), unknowns_of(steel_rod(), 3, "distributed"), [markers])
+    start = WarmStart.read(ROOT / "checkpoints" / "rod_3.safetensors")(problem)
+    assert start.Sigma0 is not None
+    loads = start.Sigma0[:, problem.state.loads.at, problem.state.loads.at]
+    assert (torch.linalg.eigvalsh(loads) > 0).all()
+    assert not torch.allclose(loads[0], loads[1])
+    told = torch.diag(T([100.0, 200.0, 300.0])).unsqueeze(0)
+    assert (torch.linalg.eigvalsh(bounded(told) - 5 * told) > 0).all()
+    assert float(bounded(1e9 * told).diagonal(dim1=1, dim2=2).sum()) < 2e4
 
 
 @pytest.mark.many_fits

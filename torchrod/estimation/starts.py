@@ -176,7 +176,7 @@ def challenged_by_cold(problem: Problem, start: Start, Sigma0: Float[Tensor, "n 
         costs = torch.stack([evaluate.cost(start.x[index]), evaluate.cost(cold)], -1)
     else:
         costs = start.costs[index]
-    guessed, known = costs.nan_to_num(torch.inf).unbind(-1)
+    guessed, known = costs.nan_to_num(torch.inf, posinf=torch.inf).unbind(-1)
     worse = ~(guessed < known)
     dropped = torch.zeros_like(start.challenged).index_copy(0, index, worse)
     x, origin = start.x.clone(), start.origin.clone()
