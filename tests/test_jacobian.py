@@ -7,7 +7,7 @@ from tests.problems import posed, slopes
 from tests.robots import T, busy_robot
 from torchrod import GaussianCoordinates, PointCoordinates, Problem, Registration, forward_jacobian
 from torchrod.estimation.result import load_covariance
-from torchrod.mechanics.jacobian import pointwise_jacobian
+from torchrod.mechanics.jacobian import moved_along, pointwise_jacobian
 from torchrod.mechanics.lie import exponential, logarithm, product
 
 
@@ -61,3 +61,20 @@ def test_the_covariance_of_a_gaussians_report_goes_by_its_derivative():
         found = load_covariance(c, gamma, own)
         J = whole.unflatten(1, (2, 4))
         assert torch.allclose(found, J @ own.unsqueeze(1) @ J.mT, rtol=1e-12, atol=1e-14)
+
+
+def test_what_moves_along_tangents():
+    """Of several tensors at once, as torch.func.jvp has it; of what nothing moves, and along no tangent, nothing."""
+    torch.manual_seed(2)
+    a, b = torch.randn(4, 3), torch.randn(4, 2)
+    da, db = torch.randn(5, 4, 3), torch.randn(5, 4, 2)
+
+    def f(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return torch.cat([torch.where(a > 0, a.sin(), a * b[:, :1]), (b * b).sum(-1, keepdim=True)], -1)
+
+    value, moves = moved_along(f, (a, b), (da, db))
+    expected = torch.stack([torch.func.jvp(f, (a, b), (x, y))[1] for x, y in zip(da, db, strict=True)], -1)
+    assert torch.equal(value, f(a, b)) and not value.requires_grad
+    assert torch.allclose(moves, expected, atol=1e-14)
+    assert moved_along(f, (a, b), (da[:0], db[:0]))[1].shape == (4, 4, 0)
+    assert (moved_along(lambda a, b: torch.ones(4, 6), (a, b), (da, db))[1] == torch.zeros(4, 6, 5)).all()

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..estimation.result import Estimate
+from ..estimation.result import Estimate, limit
 from ..estimation.solve import Settings, estimate_each
-from ..estimation.starts import Origin, Start
+from ..estimation.starts import Origin, Start, onward
 from ..mechanics.loads import PointWrenches
 from ..mechanics.statics import shape_from_base, solve_shape
 from ..model.problem import Problem
@@ -25,6 +25,11 @@ FEW_PLACES = 3  # along the rod: with more of them a rod that is fitted is as a 
 TIP_SIZES = (1.0, 3.0)  # force and moment scales of the starts
 SAME = 1e-3  # of the length: fits whose rods lie closer together than that everywhere are one
 NODES = 21
+ROUNDS, ITERATIONS = 6, 4  # of the way there, after each of which doubles are dropped: fits that are accepted have arrived
+CHUNK = 256  # samples at a time
+AT_ONCE = 1024  # fits, whose working set then stays in the cache
+WRONG = 100.0  # times what is accepted: a start that is as far as that from the readings is given up,
+STUCK = 0.8  # where a round has not lowered its cost to this share of it
 
 
 @dataclass(frozen=True)
@@ -64,8 +69,11 @@ def read_at_few_places(problem: Problem) -> Bool[Tensor, " B"]:
     return (count > 0) & (count <= FEW_PLACES)
 
 
-def _starts(problem: Problem) -> Float[Tensor, "C n"]:
-    """States in equilibrium, of the robot under the tensions of a problem of one sample."""
+def _starts(problem: Problem) -> tuple[Float[Tensor, "N n"], Int[Tensor, " N"]]:
+    """States in equilibrium, of the robot under the tensions of each sample, and which sample each is for.
+
+    Without tensions they are the same for all samples, and solved once.
+    """
     robot, state, family = problem.robot, problem.state, problem.unknowns.loads
     elsewhere = getattr(family, "elsewhere", None)
     gamma = family.start().unsqueeze(0)
@@ -76,17 +84,20 @@ def _starts(problem: Problem) -> Float[Tensor, "C n"]:
         axes = torch.cat([torch.eye(state.tip.size, dtype=DTYPE), -torch.eye(state.tip.size, dtype=DTYPE)])
         tip = torch.cat([size * axes for size in TIP_SIZES])
         gamma = gamma.expand(len(tip), -1)
-    C = len(gamma)
+    C, B, tension = len(gamma), problem.batch, problem.tension
     between = gamma.new_zeros(C, state.base.at.start - state.tip.at.stop)
-    x = torch.cat([gamma, tip, between, gamma.new_zeros(C, 6)], -1)
-    loads = list(family.loads(gamma)) if family.size else []
+    each = torch.cat([gamma, tip, between, gamma.new_zeros(C, 6)], -1)
+    x = each if tension is None else each.repeat(B, 1)
+    loads = list(family.loads(x[:, state.loads.at])) if family.size else []
     if state.tip.size:
         wrench = state.tip_wrench(x).unsqueeze(1)
         loads.append(PointWrenches(wrench[..., :3], wrench[..., 3:], torch.tensor([robot.rod.length], dtype=DTYPE)))
-    tension = None if problem.tension is None else problem.tension.expand(C, -1)
-    solved = solve_shape(robot, tuple(loads), tension, problem.s.new_tensor([robot.rod.length]), C)
+    tension = None if tension is None else tension.repeat_interleave(C, 0)
+    solved = solve_shape(robot, tuple(loads), tension, problem.s.new_tensor([robot.rod.length]), len(x))
     x[:, state.base.at] = solved.base_wrench / state.base.unit
-    return x[torch.isfinite(x).all(-1)]
+    x = x if problem.tension is not None else x.repeat(B, 1)
+    found = torch.isfinite(x).all(-1)
+    return x[found], torch.arange(B).repeat_interleave(C)[found]
 
 
 def other_solutions(
@@ -94,40 +105,72 @@ def other_solutions(
 ) -> tuple[tuple[Solution, ...], ...]:
     """For every sample of a fit the other equilibria that explain its readings too (their chi^2 is accepted), cheapest first.
 
-    Only of samples that were read at few places, and that are accepted. parts: the unknowns of each sample, as in Analysis.
+    Only of samples that were read at few places, and that are accepted. parts: the unknowns of each sample, as in Analysis. All
+    samples from all starts at once, a few iterations on coarse steps at a time; of those of a sample that have come to the same
+    rod one goes on, and none to that of the fit. What is not near the readings in the end is given up, the rest is fitted.
     """
     settings = replace(settings or Settings(), restarts=(), basins=0, sized=False)
     found: list[tuple[Solution, ...]] = [()] * problem.batch
     few = read_at_few_places(problem) & fit.accepted
     for unknowns, index in parts:
         own = problem.of(unknowns)
-        for b in index[few[index]].tolist():
-            one = own.take(torch.tensor([b]))
-            begin = _starts(one)
-            if len(begin):
-                found[b] = _others(one, fit.x[b, : own.size], begin, settings)
+        for rows in index[few[index]].split(CHUNK) if bool(few[index].any()) else ():
+            part = own.take(rows)
+            for b, others in zip(rows.tolist(), _others(part, fit.x[rows, : own.size], settings), strict=True):
+                found[b] = others
     return tuple(found)
 
 
-def _others(one: Problem, x: Float[Tensor, " n"], begin: Float[Tensor, "C n"], settings: Settings) -> tuple[Solution, ...]:
-    """Of one sample whose fit is x."""
-    many = one.take(torch.zeros(len(begin), dtype=torch.int64))
-    tried = estimate_each(many, settings, Start.at(begin, Origin.ELSEWHERE))
-    good = (tried.accepted & (tried.status == int(Status.CONVERGED))).nonzero().squeeze(-1)
-    along = torch.linspace(0, one.robot.rod.length, NODES, dtype=DTYPE)
-    known, kept = [_rod(one, x.unsqueeze(0), along)[0]], []
-    for c in good[tried.chi2[good].argsort()].tolist():
-        p = _rod(one, tried.x[c : c + 1], along)[0]
-        if all(float((p - other).norm(dim=-1).max()) > SAME * one.robot.rod.length for other in known):
-            known.append(p)
-            kept.append(
-                Solution(float(tried.chi2[c]), tried.force[c], tried.location[c], None if tried.tip is None else tried.tip[c])
-            )
-    return tuple(kept)
+def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings) -> list[tuple[Solution, ...]]:
+    """Of samples whose fits are x."""
+    x0, of = _starts(problem)
+    known, apart = _rods(problem, x), SAME * problem.robot.rod.length
+    enough = WRONG * torch.tensor([limit(n) for n in problem.seen.tolist()], dtype=DTYPE)
+    before = x0.new_full((len(x0),), torch.inf)
+    for k in range(ROUNDS):
+        if not len(of):
+            return [()] * problem.batch
+        parts = [onward(problem.take(of[at]), x0[at], ITERATIONS) for at in torch.arange(len(of)).split(AT_ONCE)]
+        x0, cost = (torch.cat(values) for values in zip(*parts, strict=True))
+        kept = _different(_rods(problem.take(of), x0), cost, of, known, apart)
+        hopeful = (cost < enough[of]) | ((cost < STUCK * before) & (k < ROUNDS - 1))
+        kept = kept[hopeful[kept]]
+        x0, of, before = x0[kept], of[kept], cost[kept]
+    if not len(of):
+        return [()] * problem.batch
+    tried = estimate_each(problem.take(of), settings, Start.at(x0, Origin.ELSEWHERE))
+    good = tried.accepted & (tried.status == int(Status.CONVERGED))
+    kept = _different(_rods(problem.take(of), tried.x), torch.where(good, tried.chi2, torch.inf), of, known, apart)
+    kept = kept[good[kept]]
+    found: list[list[Solution]] = [[] for _ in range(problem.batch)]
+    for c in kept[tried.chi2[kept].argsort(stable=True)].tolist():
+        tip = None if tried.tip is None else tried.tip[c]
+        found[int(of[c])].append(Solution(float(tried.chi2[c]), tried.force[c], tried.location[c], tip))
+    return [tuple(others) for others in found]
 
 
-def _rod(one: Problem, x: Float[Tensor, "1 n"], along: Float[Tensor, " N"]) -> Float[Tensor, "1 N 3"]:
-    """The centre line (m) at other places than the sensors'."""
-    state = one.state
-    loads = one.unknowns.loads.loads(x[:, state.loads.at]) if state.loads.size else ()
-    return shape_from_base(one.robot, loads, state.base.of(x), one.pulling(x), along, one.steps, differentiable=False).p
+def _different(
+    rods: Float[Tensor, "N K 3"], cost: Float[Tensor, " N"], of: Int[Tensor, " N"], known: Float[Tensor, "B K 3"], apart: float
+) -> Int[Tensor, " k"]:
+    """Which rods to keep: of those of a sample that are no farther apart than that (m) the cheapest, none like its known one."""
+    kept = []
+    for b in of.unique().tolist():
+        mine = (of == b).nonzero().squeeze(-1)
+        mine = mine[cost[mine].argsort(stable=True)]
+        p = rods[mine]
+        double = ((p - known[b]).norm(dim=-1).amax(-1) <= apart).tolist()
+        near = ((p.unsqueeze(1) - p).norm(dim=-1).amax(-1) <= apart).numpy()
+        chosen: list[int] = []
+        for i, row in enumerate(mine.tolist()):
+            if not double[i] and not near[i, chosen].any():
+                chosen.append(i)
+                kept.append(row)
+    return torch.tensor(kept, dtype=torch.int64)
+
+
+def _rods(problem: Problem, x: Float[Tensor, "B n"]) -> Float[Tensor, "B N 3"]:
+    """The centre lines (m) at other places than the sensors'."""
+    state, robot = problem.state, problem.robot
+    along = torch.linspace(0, robot.rod.length, NODES, dtype=DTYPE)
+    loads = problem.unknowns.loads.loads(x[:, state.loads.at]) if state.loads.size else ()
+    return shape_from_base(robot, loads, state.base.of(x), problem.pulling(x), along, problem.steps, differentiable=False).p

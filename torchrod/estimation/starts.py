@@ -136,18 +136,18 @@ def _of_four_ways(problem: Problem, cold: Float[Tensor, "B n"]) -> Float[Tensor,
     for angle in PUSH_ANGLES if newtons > 0 else ():
         push = PUSH * problem.robot.rod.force_scale / newtons
         start[:2] = start.new_tensor([push * math.cos(angle), push * math.sin(angle)])
-        x, cost = _followed(problem, in_equilibrium(problem, start.expand(len(cold), -1)))
+        x, cost = onward(problem, in_equilibrium(problem, start.expand(len(cold), -1)), FOLLOWED)
         cheaper = cost < least
         best, least = torch.where(cheaper.unsqueeze(-1), x, best), torch.where(cheaper, cost, least)
     return best
 
 
-def _followed(problem: Problem, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B n"], Float[Tensor, " B"]]:
+def onward(problem: Problem, x: Float[Tensor, "B n"], iterations: int) -> tuple[Float[Tensor, "B n"], Float[Tensor, " B"]]:
     """x after a few iterations of the filter on coarse steps, and its cost."""
     coarse = problem.coarse
     evaluate, eye = evaluator(coarse), torch.eye(problem.size, dtype=x.dtype).expand(len(x), -1, -1)
     run = ekf.Iterate.start(x, eye, torch.inf)
-    for _ in range(FOLLOWED):
+    for _ in range(iterations):
         sums, prior = evaluate.sums(run.x), (coarse.mean, coarse.precision)
         run = ekf.advance(run, normal(coarse, sums), eye, prior, x.new_ones(problem.size), ekf.Limits())
         if bool(run.done.all()):

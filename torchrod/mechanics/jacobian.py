@@ -41,3 +41,24 @@ def pointwise_jacobian(
         each = function(leaf).diagonal(dim1=0, dim2=-1)
         rows = torch.autograd.grad(each.sum(), leaf)[0] if m else leaf.detach()
     return value, rows.movedim(0, 1)
+
+
+def moved_along(
+    function: Callable[..., Float[Tensor, "B m"]], at: tuple[Tensor, ...], tangents: tuple[Float[Tensor, "n ..."], ...]
+) -> tuple[Float[Tensor, "B m"], Float[Tensor, "B m n"]]:
+    """Value, and the derivatives along n tangents, of a function of several tensors that move at once.
+
+    Backwards twice: the pull-back J^T v is linear in v, and its own pull-back of a tangent t is J t. The same as torch.func.jvp,
+    which works out in Python which shape the zero tangent has of everything that stays where it is: 50 ms a call, however few the
+    samples.
+    """
+    with torch.enable_grad():
+        leaves = [x.detach().requires_grad_() for x in at]
+        value = function(*leaves)
+        if not (value.requires_grad and len(tangents[0])):
+            return value.detach(), value.new_zeros(*value.shape, len(tangents[0]))
+        v = torch.zeros_like(value, requires_grad=True)
+        pulled = torch.autograd.grad(value, leaves, v, create_graph=True, materialize_grads=True)
+    used = [(p, t) for p, t in zip(pulled, tangents, strict=True) if p.requires_grad]
+    (columns,) = torch.autograd.grad([p for p, _ in used], v, [t for _, t in used], is_grads_batched=True)
+    return value.detach(), columns.movedim(0, -1)

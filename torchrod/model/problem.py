@@ -13,11 +13,10 @@ from functools import cached_property, partial
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.func import jvp, vmap
 
 from ..mechanics.grid import DEFAULT_STEPS, Places, on_rod
 from ..mechanics.integrate import march_linearized
-from ..mechanics.jacobian import forward_jacobian
+from ..mechanics.jacobian import forward_jacobian, moved_along
 from ..mechanics.lie import Matrix, Vector, conjugate, exponential, move, product, unrotate
 from ..mechanics.loads import LoadIntegrals, total
 from ..mechanics.robot import Robot
@@ -403,7 +402,8 @@ class Problem(Float64):
             assert along.G is not None and along.G2 is not None and beyond.G is not None and beyond.G2 is not None
             return torch.cat([torch.cat([along.G, along.G2], -1).reshape(B, 18 * S), beyond.G, beyond.G2], -1)
 
-        value, slope = forward_jacobian(integrals, gamma)
+        axes = torch.eye(g, dtype=x.dtype).unsqueeze(1).expand(g, B, g)
+        value, slope = moved_along(integrals, (gamma,), (axes,))
         G, dG = value[:, :-6].reshape(B, S, 3, 6), slope[:, :-6].reshape(B, S, 3, 6, g)
         known = stage_table(self.robot, (), self.tension, grid)
         table = replace(known, loads=known.loads + LoadIntegrals(G[..., :3], G[..., 3:]))
@@ -432,10 +432,5 @@ class Problem(Float64):
         def read(states: Tensor, beyond: Tensor, x: Tensor) -> Tensor:
             return self._read(shape_of(section, states, LoadIntegrals(beyond[..., :3], beyond[..., 3:])), x)
 
-        def column(ds: Tensor, db: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-            value, tangent, *_ = jvp(read, (states, beyond, x), (ds, db, e.expand_as(x).contiguous()))
-            return value, tangent
-
-        axes = vmap(column, out_dims=(None, 0))  # pyright: ignore[reportArgumentType]
-        h, columns = axes(d_states, d_beyond, torch.eye(n, dtype=x.dtype))
-        return h, columns.movedim(0, -1)
+        axes = torch.eye(n, dtype=x.dtype).unsqueeze(1).expand(n, *x.shape)
+        return moved_along(read, (states, beyond, x), (d_states, d_beyond, axes))
