@@ -24,7 +24,7 @@ from ..mechanics.statics import beyond_tip, grid_for, stage_table
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates, SmoothCoordinates
 from ..model.load_families.family import FAINT
 from ..model.problem import TIP_ROWS, Problem
-from ..model.uncertainty import Warp, parabola
+from ..model.uncertainty import Warp, near_zero
 from ..util.by_value import Kept, key
 from . import filter as ekf
 
@@ -324,7 +324,7 @@ class NearlyKnownEvaluator(TorchEvaluator):
         plain, theta = self.problem.without_parameters(x)
         exact = self._exact.h(plain)
         off = (_warped(exact if model is self._exact else model.h(plain), warp) for model, warp in self._off)
-        return parabola(exact, off, theta)[0]
+        return near_zero(exact, off, theta, self.problem.wide)[0]
 
     def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """See Problem."""

@@ -25,7 +25,7 @@ from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_f
 from ..util.by_value import Kept, key
 from ..util.precision import DTYPE, Float64
 from .sensors import Markers, RodState, Sensor, TipWrench
-from .uncertainty import Warp, parabola
+from .uncertainty import Warp, near_zero
 from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
@@ -47,6 +47,7 @@ _OF_READINGS = (
     "groups",
     "group_count",
     "usable",
+    "wide",
 )
 
 
@@ -233,6 +234,8 @@ class Problem(Float64):
             prior = prior[0][index] if prior[0].ndim > 1 else prior[0], prior[1][index] if prior[1].ndim > 1 else prior[1]
         part = replace(self, sensors=[sensor.take(index) for sensor in self.sensors], tension=tension, prior=prior)
         vars(part)["state"] = self.state  # which for a robot of `off` has the units of the exact one
+        if "wide" in vars(self):
+            vars(part)["wide"] = self.wide
         return part
 
     def without(self, groups: Bool[Tensor, "B G"]) -> "Problem":
@@ -305,7 +308,7 @@ class Problem(Float64):
             return self._read(self.shape(x, differentiable), x)
         plain, theta = self.without_parameters(x)
         h = self.exact.h(plain, differentiable)
-        return parabola(h, (other.h(plain, differentiable) for other in self.off), theta)[0]
+        return near_zero(h, (other.h(plain, differentiable) for other in self.off), theta, self.wide)[0]
 
     # The robot's parameters: model.uncertainty.
 
@@ -318,7 +321,7 @@ class Problem(Float64):
 
     @cached_property
     def off(self) -> list["Problem"]:
-        """With every parameter off by a standard deviation, upwards and downwards, in turn; x in the units of the exact one."""
+        """With every parameter off, in turn, as Uncertainty.nearby has it; x in the units of the exact one."""
         exact, found = self.exact, []
         assert self.unknowns.uncertainty is not None
         for robot, warp in self.unknowns.uncertainty.nearby(exact.robot):
@@ -326,6 +329,12 @@ class Problem(Float64):
             vars(other)["state"] = exact.state
             found.append(other)
         return found
+
+    @cached_property
+    def wide(self) -> tuple[bool, ...]:
+        """Which parameters have a quartic (model.uncertainty)."""
+        assert self.unknowns.uncertainty is not None
+        return self.unknowns.uncertainty.wide(self.robot)
 
     def without_parameters(self, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... m"], Float[Tensor, "... k"]]:
         """x without the parameters, and these, in standard deviations."""
@@ -340,8 +349,8 @@ class Problem(Float64):
     ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """h and H from those of `exact` and of every `off` at x without the parameters."""
         (h, H), at = at_zero, self.state.parameters.at.start
-        h, slopes = parabola(h, (one for one, _ in off), theta)
-        H, _ = parabola(H, (one for _, one in off), theta)
+        h, slopes = near_zero(h, (one for one, _ in off), theta, self.wide)
+        H, _ = near_zero(H, (one for _, one in off), theta, self.wide)
         return h, torch.cat([H[..., :at], torch.stack(slopes, -1), H[..., at:]], -1)
 
     def _read(self, shape: Shape, x: Float[Tensor, "... n"]) -> Float[Tensor, "... z"]:

@@ -6,12 +6,13 @@ error unknown, within what is known of it, intervals hold (docs/trust.md). The m
     (1)  h(x, theta) = h(x, 0) + sum_k theta_k (h_k+ - h_k-) / 2 + theta_k^2 (h_k+ + h_k- - 2 h(x, 0)) / 2,    theta_k ~ N(0, 1)
 
 through h(x, 0) and h_k+-, of a robot whose parameter k is off by one standard deviation upwards and downwards; the errors of two
-parameters act side by side. dh/dx follows by the same parabola. Where a calibration has found errors that are correlated, theta_k
-moves all of them along a column of a root of their covariance.
+parameters act side by side. dh/dx follows by the same parabola. Of a stiffness that may be off by more than WIDE the slope of a
+parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through half a deviation as well. Where a
+calibration has found errors that are correlated, theta_k moves all of them along a column of a root of their covariance.
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -31,6 +32,7 @@ RELATIVE = ("stiffness", "mass", "tension")  # errors that are shares of a numbe
 OF_TENDONS = ("tension", "tension_offset", "friction", "tendon_place")
 SHIFT, TURN = (tuple(f"frame_{kind}{axis}" for axis in "xyz") for kind in ("", "turn_"))  # entries of a Warp
 STRAIN = tuple(f"metric_{axes}" for axes in ("xx", "yy", "zz", "yz", "xz", "xy"))
+WIDE, OF_STIFFNESS = 0.04, ("stiffness", "oval")  # a share, and whose
 NONE = 1e-12  # of a standard deviation: what is left of a direction that is none
 Change = Callable[[Robot, float], Robot]
 
@@ -180,14 +182,22 @@ class Uncertainty:
         C[at.unsqueeze(-1), at] += self.found.covariance - torch.diag(self.found.covariance.diagonal())
         return std.unsqueeze(-1) * torch.linalg.cholesky(_correlation(C) + NONE * torch.eye(len(C), dtype=DTYPE))
 
+    def wide(self, robot: Robot) -> tuple[bool, ...]:
+        """Of every unknown xi whether a parabola does not do for it."""
+        stiff = [p.name.split("_")[0] in OF_STIFFNESS for p in self.parameters(robot)]
+        columns = self.root(robot).mT.tolist()
+        return tuple(any(s and abs(error) > WIDE for s, error in zip(stiff, errors, strict=True)) for errors in columns)
+
     def nearby(self, robot: Robot) -> list[tuple[Robot, Warp | None]]:
-        """Robots off by one of every unknown xi, upwards and downwards, in turn, and how they are measured."""
+        """Robots off by one of every unknown xi, upwards and downwards, in turn, and by half of it where that is wide, and how they
+        are measured.
+        """
         listed, found = self.parameters(robot), []
-        for errors in self.root(robot).mT.tolist():
-            for sign in (1.0, -1.0):
-                off, seen = robot, {p.name: sign * error for p, error in zip(listed, errors, strict=True) if p.seen and error}
+        for errors, wide in zip(self.root(robot).mT.tolist(), self.wide(robot), strict=True):
+            for share in (1.0, -1.0, 0.5, -0.5) if wide else (1.0, -1.0):
+                off, seen = robot, {p.name: share * error for p, error in zip(listed, errors, strict=True) if p.seen and error}
                 for parameter, error in zip(listed, errors, strict=True):
-                    off = parameter.change(off, sign * error) if error and parameter.change is not None else off
+                    off = parameter.change(off, share * error) if error and parameter.change is not None else off
                 found.append((off, Warp.of(seen) if seen else None))
         return found
 
@@ -340,14 +350,22 @@ def _with_rows(rod: Rod, places: list[float]) -> Float[Tensor, "rows 4"]:
     return rows[rows[:, 0].argsort(stable=True)]
 
 
-def parabola(
-    at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"]
+def near_zero(
+    at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"], wide: Sequence[bool]
 ) -> tuple[Float[Tensor, "B z *m"], list[Float[Tensor, "B z *m"]]]:
-    """(1), and its derivatives by each theta, from the values at zero and at one standard deviation to either side, in turn."""
-    ends, value, slopes = iter(off), at_zero.clone(), []
-    for k, (up, down) in enumerate(zip(ends, ends, strict=True)):
+    """(1), and its derivatives by each theta, from the values at zero and at what `nearby` has of each, in turn."""
+    others, value, slopes = iter(off), at_zero.clone(), []
+    for k, whether in enumerate(wide):
         t = theta[:, k].reshape(-1, *[1] * (at_zero.ndim - 1))
-        slope, curve = 0.5 * (up - down), 0.5 * (up + down) - at_zero
-        value.addcmul_(t, slope).addcmul_(t**2, curve)
-        slopes.append(slope.addcmul_(2 * t, curve))
+        up, down = next(others), next(others)
+        odd, even = 0.5 * (up - down), 0.5 * (up + down) - at_zero
+        slope = odd
+        if whether:
+            up, down = next(others), next(others)
+            cubic, quartic = (odd - (up - down)) / 0.75, (even - 4 * (0.5 * (up + down) - at_zero)) / 0.75
+            odd, even = odd - cubic, even - quartic
+            value.addcmul_(t**3, cubic).addcmul_(t**4, quartic)
+            slope = odd + 3 * t**2 * cubic + 4 * t**3 * quartic
+        value.addcmul_(t, odd).addcmul_(t**2, even)
+        slopes.append(slope + 2 * t * even)
     return value, slopes
