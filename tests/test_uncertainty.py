@@ -326,3 +326,26 @@ def test_markers_know_nothing_of_a_stiffness_of_weightless_rods():
     assert (fit.parameters_std > 0.0995).all()
     relative = fit.magnitude_std / fit.magnitude
     assert (relative > 0.098).all() and (relative < 0.13).all()
+
+
+def test_two_stiffnesses_off_at_once_are_one_robot():
+    """h at theta = (1, 1) and (-1, -1) is that of robots that are off by both, but for what is of third order."""
+    robot = busy_robot()
+    stated = Uncertainty(stiffness=0.1, oval=0.08)
+    problem = problem_of(robot, stated, 20)
+    names = [p.name for p in stated.parameters(robot)]
+    x = torch.zeros(2, problem.size)
+    x[:, problem.state.base.at] = 0.5
+    plain, _ = problem.without_parameters(x)
+    at = [problem.state.parameters.at.start + names.index(name) for name in ("stiffness", "oval_2")]
+    found, true = [], []
+    for sign in (1.0, -1.0):
+        both = x.clone()
+        both[:, at] = sign
+        other, _ = stated.found_at(robot, {"stiffness": 0.1 * sign, "oval_2": 0.08 * sign})
+        off = replace(problem.exact, robot=other)
+        vars(off)["state"] = problem.exact.state
+        found.append(problem.h(both, False))
+        true.append(off.h(plain, False))
+        assert float((found[-1] - true[-1]).abs().max()) < 0.02 * float((problem.exact.h(plain, False) - true[-1]).abs().max())
+    assert torch.allclose(found[0] + found[1], true[0] + true[1], rtol=0, atol=1e-12), "what is even in the two errors is exact"

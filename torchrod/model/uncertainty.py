@@ -7,10 +7,12 @@ error unknown, within what is known of it, intervals hold (docs/trust.md). The m
 
 through h(x, 0) and h_k+-, of a robot whose parameter k is off by one standard deviation upwards and downwards; the errors of two
 parameters act side by side. dh/dx follows by the same parabola. Of a stiffness that may be off by more than WIDE the slope of a
-parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through half a deviation as well. Where a
-calibration has found errors that are correlated, theta_k moves all of them along a column of a root of their covariance.
+parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through half a deviation as well, and two of
+them have a mixed term, through robots that are off by both. Where a calibration has found errors that are correlated, theta_k moves
+all of them along a column of a root of their covariance.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -32,6 +34,7 @@ RELATIVE = ("stiffness", "mass", "tension")  # errors that are shares of a numbe
 OF_TENDONS = ("tension", "tension_offset", "friction", "tendon_place")
 SHIFT, TURN = (tuple(f"frame_{kind}{axis}" for axis in "xyz") for kind in ("", "turn_"))  # entries of a Warp
 STRAIN = tuple(f"metric_{axes}" for axes in ("xx", "yy", "zz", "yz", "xz", "xy"))
+MOST_MIXED = 4  # stiffnesses, of which all pairs have a mixed term
 WIDE, OF_STIFFNESS = 0.04, ("stiffness", "oval")  # a share, and whose
 NONE = 1e-12  # of a standard deviation: what is left of a direction that is none
 Change = Callable[[Robot, float], Robot]
@@ -189,17 +192,22 @@ class Uncertainty:
         return tuple(any(s and abs(error) > WIDE for s, error in zip(stiff, errors, strict=True)) for errors in columns)
 
     def nearby(self, robot: Robot) -> list[tuple[Robot, Warp | None]]:
-        """Robots off by one of every unknown xi, upwards and downwards, in turn, and by half of it where that is wide, and how they
-        are measured.
+        """Robots off by one of every unknown xi, upwards and downwards, in turn, and by half of it where that is wide; then by both
+        of every `mixed` pair; and how they are measured.
         """
-        listed, found = self.parameters(robot), []
-        for errors, wide in zip(self.root(robot).mT.tolist(), self.wide(robot), strict=True):
-            for share in (1.0, -1.0, 0.5, -0.5) if wide else (1.0, -1.0):
-                off, seen = robot, {p.name: share * error for p, error in zip(listed, errors, strict=True) if p.seen and error}
-                for parameter, error in zip(listed, errors, strict=True):
-                    off = parameter.change(off, share * error) if error and parameter.change is not None else off
-                found.append((off, Warp.of(seen) if seen else None))
-        return found
+        columns, wide = self.root(robot).mT, self.wide(robot)
+        shares = [(k, share) for k, whether in enumerate(wide) for share in ((1.0, -1.0, 0.5, -0.5) if whether else (1.0, -1.0))]
+        every = [share * columns[k] for k, share in shares]
+        every += [sign * (columns[i] + columns[j]) for i, j in mixed(wide) for sign in (1.0, -1.0)]
+        return [self._off_by(robot, errors.tolist()) for errors in every]
+
+    def _off_by(self, robot: Robot, errors: list[float]) -> tuple[Robot, Warp | None]:
+        """The robot with errors of all its parameters, and how it is measured."""
+        listed = self.parameters(robot)
+        seen = {p.name: error for p, error in zip(listed, errors, strict=True) if p.seen and error}
+        for parameter, error in zip(listed, errors, strict=True):
+            robot = parameter.change(robot, error) if error and parameter.change is not None else robot
+        return robot, Warp.of(seen) if seen else None
 
     def found_at(self, robot: Robot, errors: Mapping[str, float]) -> tuple[Robot, Warp]:
         """The robot with errors by their names, as a fit has found them, and how it is measured; names of others are left aside."""
@@ -354,12 +362,13 @@ def near_zero(
     at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"], wide: Sequence[bool]
 ) -> tuple[Float[Tensor, "B z *m"], list[Float[Tensor, "B z *m"]]]:
     """(1), and its derivatives by each theta, from the values at zero and at what `nearby` has of each, in turn."""
-    others, value, slopes = iter(off), at_zero.clone(), []
-    for k, whether in enumerate(wide):
-        t = theta[:, k].reshape(-1, *[1] * (at_zero.ndim - 1))
+    others, value, slopes, curved = iter(off), at_zero.clone(), [], []
+    each = [t.reshape(-1, *[1] * (at_zero.ndim - 1)) for t in theta.unbind(-1)]
+    for t, whether in zip(each, wide, strict=True):
         up, down = next(others), next(others)
         odd, even = 0.5 * (up - down), 0.5 * (up + down) - at_zero
         slope = odd
+        curved.append(even)
         if whether:
             up, down = next(others), next(others)
             cubic, quartic = (odd - (up - down)) / 0.75, (even - 4 * (0.5 * (up + down) - at_zero)) / 0.75
@@ -368,4 +377,15 @@ def near_zero(
             slope = odd + 3 * t**2 * cubic + 4 * t**3 * quartic
         value.addcmul_(t, odd).addcmul_(t**2, even)
         slopes.append(slope + 2 * t * even)
+    for i, j in mixed(wide):
+        cross = 0.5 * (next(others) + next(others)) - at_zero - curved[i] - curved[j]
+        value.addcmul_(each[i] * each[j], cross)
+        slopes[i].addcmul_(each[j], cross)
+        slopes[j].addcmul_(each[i], cross)
     return value, slopes
+
+
+def mixed(wide: Sequence[bool]) -> list[tuple[int, int]]:
+    """Pairs of wide ones; none where there are more than MOST_MIXED of these."""
+    at = [k for k, whether in enumerate(wide) if whether]
+    return list(itertools.combinations(at, 2)) if len(at) <= MOST_MIXED else []
