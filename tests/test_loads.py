@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.robots import T, steel_rod
-from torchrod import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads, shape_from_base
+from torchrod import FourierLoads, GaussianLoads, PointForces, PointWrenches, PolynomialLoads, forward_jacobian, shape_from_base
 from torchrod.mechanics.loads import on_rod_fraction
 
 L = 0.4
@@ -76,16 +76,18 @@ def test_net_force_is_the_papers_13_and_the_rod_feels_less_at_the_tip():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gradcheck(name):
-    """Forward-mode derivatives of the whole rod in every parameter, alpha included, against finite differences."""
+def test_derivatives_are_those_of_differences(name):
+    """Forward-mode derivatives of the whole rod in every parameter, alpha included."""
     robot, s = steel_rod(), T([0.1, 0.25, 0.4])
 
     def h(x):
         shape = shape_from_base(robot, (families(x[..., :8])[name],), x[..., 8:] * T([1, 1, 1, 0.2, 0.2, 0.2]), None, s, 4)
         return torch.cat([shape.p.flatten(-2), shape.tip_residual], -1)
 
-    x = T([[0.7, -0.4, 0.31, 0.2, 0.5, -0.6, 0.1, 0.4, 0.3, 0.2, 0.1, 0.3, -0.2, 0.1]]).requires_grad_()
-    assert torch.autograd.gradcheck(h, (x,), eps=1e-6, atol=1e-6, check_forward_ad=True, check_backward_ad=False)
+    x = T([[0.7, -0.4, 0.31, 0.2, 0.5, -0.6, 0.1, 0.4, 0.3, 0.2, 0.1, 0.3, -0.2, 0.1]])
+    step = 1e-6 * torch.eye(x.shape[-1])
+    slopes = (h(x + step) - h(x - step)) / 2e-6
+    assert torch.allclose(slopes.mT, forward_jacobian(h, x)[1][0], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
