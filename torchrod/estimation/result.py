@@ -427,7 +427,7 @@ def make_estimate(
         centre_line=kept(sums.line),
         residual=_read_only(problem)(kept(problem.distances(rows))),
         row_residual=kept(rows),
-        tension=kept(pulling) if free and (pulling := problem.pulling(x)) is not None else None,
+        tension=kept(found) if free and (found := problem.tensions(x)) is not None else None,
         tension_std=settled(variance.clamp(min=0).sqrt()) if free else None,
         parameters=kept(state.parameters.of(x)) if state.parameters.size else None,
         parameters_std=settled(of_parameters.clamp(min=0).sqrt()) if state.parameters.size else None,
