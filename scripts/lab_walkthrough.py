@@ -40,7 +40,10 @@ def main() -> int:
             spent = time.process_time() - start
             found = judged(case, Path(folder, "loads.json"))
             os.chdir(home)
-        parts = [f"{n} {e:.3g} {'N' if n == 'force' else 'm'} rms, {ratio:.2f} of the bound" for n, (e, ratio) in found.of.items()]
+        parts = [
+            f"{n} {e:.3g} {'N' if n.startswith('force') else 'm'} rms, {ratio:.2f} of the bound"
+            for n, (e, ratio) in found.of.items()
+        ]
         print(f"{name}: {100 * found.accepted:.1f} % accepted; {'; '.join(parts)}; {spent:.0f} s of CPU\n", flush=True)
         far += any(ratio > MOST for _, ratio in found.of.values())
     return 1 if far else 0

@@ -121,6 +121,44 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     check_agreement(problem, x)
 
 
+def test_tensions_about_zero():
+    """tau = (r + w)^2 / (4 w) within +-w of a reading r of 0, else max(r, 0); by both paths."""
+    std, w = 0.5, 0.05
+    problem, x = case(hanging(), GaussianCoordinates(1, 0.4, 1.0), tension_std=std)
+    problem = replace(problem, tension=torch.zeros(B, 2))
+    r = T([[-1.0, 0.03], [-0.049, 0.05], [0.0, 0.2], [0.049, -0.05], [-0.02, 0.051]])
+    x[:, problem.state.tension.at] = r / std
+    expected = torch.where(r.abs() < w, (r + w) ** 2 / (4 * w), r.clamp(min=0))
+    pulling = problem.pulling(x)
+    assert pulling is not None
+    assert torch.allclose(pulling, expected, rtol=0, atol=1e-15)
+    check_agreement(problem, x)
+    tendons = tuple(replace(t, tension_gain=1.5, tension_offset=0.01) for t in hanging().tendons.tendons)
+    gains = replace(problem, robot=replace(problem.robot, tendons=Tendons(tendons)))
+    assert not kernel_serves(gains)  # whose errors are of tensions, not of readings
+    tau, w = 1.5 * r + 0.01, 1.5 * w
+    expected, pulling = torch.where(tau.abs() < w, (tau + w) ** 2 / (4 * w), tau.clamp(min=0)), gains.pulling(x)
+    assert pulling is not None
+    assert torch.allclose(gains.robot.tendons.true_tension(pulling), expected, rtol=0, atol=1e-15)
+
+
+def test_fits_settle_where_a_tendon_goes_slack():
+    """Four tendons, of which each is slack two times out of five, with load cells that read noise about zero."""
+    tendons = Tendons(tuple(Tendon.straight(0.007 * math.cos(a), 0.007 * math.sin(a), 0.4) for a in (0.0, 1.6, 3.1, 4.7)))
+    robot, n, g = Robot(steel_rod().rod, tendons), 200, torch.Generator().manual_seed(5)
+    true = 3 * torch.rand(n, 4, generator=g) * (torch.rand(n, 4, generator=g) > 0.4)
+    force = torch.nn.functional.pad(0.6 * torch.randn(n, 1, 2, generator=g), (0, 1))
+    s, at = torch.linspace(0.02, 0.4, 20), 0.1 + 0.28 * torch.rand(n, 1, generator=g)
+    p = solve_shape(robot, (PointForces(force, at),), true, s, n).p
+    p = p + 5e-4 * torch.randn(p.shape, generator=g)
+    reading = (true + 0.1 * torch.randn(n, 4, generator=g)).clamp(min=0)
+    fit = estimate(posed(s, p, 5e-4, robot, GaussianCoordinates(1, 0.4, 1.0, "point"), reading, tension_std=0.1))
+    assert (fit.status == 0).double().mean() > 0.995
+    assert fit.accepted.double().mean() > 0.98
+    z = (fit.magnitude[:, 0] - force[:, 0].norm(dim=-1)) / fit.magnitude_std[:, 0]
+    assert 0.9 < float((z.abs() < 1.96).double().mean()) < 0.99
+
+
 @pytest.mark.parametrize("family", DRAGGING)
 @pytest.mark.parametrize("robot", ["passive", "straight tendons"])
 def test_loads_that_drag_along_the_rod(robot, family):

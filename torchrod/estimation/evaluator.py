@@ -23,7 +23,7 @@ from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates, SmoothCoordinates
 from ..model.load_families.family import FAINT
-from ..model.problem import TIP_ROWS, Problem
+from ..model.problem import SLACK, TIP_ROWS, Problem
 from ..model.uncertainty import Warp, near_zero
 from ..util.by_value import Kept, key
 from . import filter as ekf
@@ -126,6 +126,8 @@ def kernel_serves(problem: Problem) -> bool:
         return False
     if family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
+    if problem.state.tension.size and any(t.tension_gain != 1 for t in robot.tendons.tendons):
+        return False  # the kernel adds an error of the tension, not of the reading
     if family == "point":
         straight = all(len(t.routing) == 1 and not t.discs for t in robot.tendons.tendons)
         return kernel.available() and straight and len(robot.rod.reference_curvature) == 1 and robot.rod.pieces is None
@@ -421,6 +423,7 @@ def _units(problem: Problem) -> dict[str, float]:
         "length_unit": unit(state.registration.unit, 0),
         "angle_unit": unit(state.registration.unit, 3),
         "tension_unit": unit(state.tension.unit, 0),
+        "slack": SLACK * unit(state.tension.unit, 0),
     }
 
 

@@ -444,7 +444,7 @@ def make_estimate(
         centre_line=kept(sums.line),
         residual=_read_only(problem)(kept(problem.distances(rows))),
         row_residual=kept(rows),
-        tension=kept(pulling) if state.tension.size and (pulling := problem.pulling(x)) is not None else None,
+        tension=kept(pulling) if state.tension.size and (pulling := problem.tensions(x)) is not None else None,
         parameters=kept(state.parameters.of(x)) if state.parameters.size else None,
         outlier=outlier,
         cost=kept(cost),

@@ -77,6 +77,7 @@ struct Group {
     Lanes lanes;
     int64_t tangents, load_tangents, tension_tangents;
     double tension_unit;  // N, of one unit of a tension tangent
+    double slack;         // N, within which of zero a tension has no kink
     const V* tension;     // (tension_tangents), what the tensions' unknowns add (N)
     const V* local;       // (3 S + 1, 1 + load_tangents, PARTS): the stages of every step, then beyond the tip; or null
     const V* node_moves;  // (S + 1, load_tangents): how the nodes move; null where they do not
@@ -113,10 +114,12 @@ inline void stage_of(const Group& g, int64_t row, Stage& s) {
     for (int64_t t = 0; t < m.tendons; t++) {
         s.tau[t] = fetch(m.tau, g.lanes, row * m.tendons + t);
         s.tau_unit[t] = V{};
-        if (t >= g.tension_tangents) continue;  // else tau = max(reading + unknown, 0) where the tendon pulls at all
+        if (t >= g.tension_tangents) continue;  // else the eased max(reading + unknown, 0) where the tendon pulls at all
         const Mask on = fetch(g.active, g.lanes, row * m.tendons + t) > 0;
         const V pull = s.tau[t] + g.tension[t];
-        s.tau[t] = select(on, larger(pull, V{}), V{});
-        s.tau_unit[t] = select(on & (pull > 0), splat(g.tension_unit), V{});
+        const V above = larger(pull + g.slack, V{});
+        const Mask eased = pull < g.slack;
+        s.tau[t] = select(on, select(eased, above * above * (0.25 / g.slack), pull), V{});
+        s.tau_unit[t] = select(on, g.tension_unit * select(eased, above * (0.5 / g.slack), splat(1.0)), V{});
     }
 }

@@ -157,9 +157,25 @@ class Tendons:
 
     def true_tension(self, reading: Float[Tensor, "... T"], clamped: bool = True) -> Float[Tensor, "... T"]:
         """tau = max(gain reading + offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
-        gain, offset = (torch.tensor([getattr(t, f"tension_{k}") for t in self.tendons], dtype=DTYPE) for k in ("gain", "offset"))
+        gain, offset = self._cells
         tau = gain * reading + offset
         return tau.clamp(min=0.0) if clamped else tau
+
+    @property
+    def _cells(self) -> tuple[Float[Tensor, " T"], Float[Tensor, " T"]]:
+        """Gain and offset (N) of every tendon's load cell."""
+        gain, offset = (torch.tensor([getattr(t, f"tension_{k}") for t in self.tendons], dtype=DTYPE) for k in ("gain", "offset"))
+        return gain, offset
+
+    def eased(self, reading: Float[Tensor, "... T"], width: Float[Tensor, " T"]) -> Float[Tensor, "... T"]:
+        """Readings (N) whose true tensions have no kink where a tendon goes slack: for tau within +-w of 0
+
+        max(tau, 0)  ->  (tau + w)^2 / (4 w),    w: width (N) of a reading, as the load cell's gain makes a tension of it
+        """
+        gain, offset = self._cells
+        tau, w = gain * reading + offset, gain * width
+        eased = torch.where(tau < w, (tau + w).clamp(min=0.0).square() / (4 * w), tau)
+        return torch.where(tau < w, (eased - offset) / gain, reading)
 
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
         """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""

@@ -30,6 +30,7 @@ from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
 TIP_ROWS = 6
+SLACK = 0.1  # of a tension's standard deviation: within this of zero its going slack is eased, so that the filter can settle there
 FINEST = 5e-7  # of the length: the least noise of a marker. What steps and round-off leave must not decide a verdict
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
@@ -289,10 +290,15 @@ class Problem(Float64):
 
     # The model.
 
-    def pulling(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... T"] | None:
-        """The tensions (N) that x takes to be pulling: the readings, with their errors where those are unknown."""
+    def tensions(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... T"] | None:
+        """The readings (N) of the load cells, without the errors that x says they have."""
         tension = self.state.tension
         return self.tension if self.tension is None or not tension.size else self.tension + tension.of(x)
+
+    def pulling(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... T"] | None:
+        """The readings (N) that x takes the tendons to pull by: `tensions`, eased to none where a tendon goes slack."""
+        tension, found = self.state.tension, self.tensions(x)
+        return found if found is None or not tension.size else self.robot.tendons.eased(found, SLACK * tension.unit)
 
     def shape(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Shape:
         """The rod at the sensors' arc lengths, in its own base frame; what is only nearly known of it as its file has it."""
