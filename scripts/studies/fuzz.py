@@ -370,7 +370,7 @@ def _of_arrays(content: bytes, chance: random.Random) -> bytes:
                 warnings.simplefilter("ignore")
                 try:
                     arrays[name] = old.astype(chance.choice(fresh))
-                except (ValueError, TypeError):
+                except (ValueError, TypeError, RuntimeError):
                     arrays[name] = np.array(["x"])
         elif old.dtype.kind == "f" and old.size:
             value = chance.choice([np.nan, np.inf, -np.inf, 1e308, -1.0, 0.0, 5e-324, 1e6])

@@ -20,6 +20,7 @@ from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
 from ..util.status import Status
+from ..util.threads import one_thread
 
 FEW_PLACES = 3  # along the rod: with more of them a rod that is fitted is as a rule the only one
 TIP_SIZES = (1.0, 3.0)  # force and moment scales of the starts
@@ -115,8 +116,9 @@ def other_solutions(
     for unknowns, index in parts:
         own = problem.of(unknowns)
         for rows in index[few[index]].split(CHUNK) if bool(few[index].any()) else ():
-            part = own.take(rows)
-            for b, others in zip(rows.tolist(), _others(part, fit.x[rows, : own.size], settings), strict=True):
+            with one_thread(True):  # many small tensors, which several threads wait for longer than they work at
+                each = _others(own.take(rows), fit.x[rows, : own.size], settings)
+            for b, others in zip(rows.tolist(), each, strict=True):
                 found[b] = others
     return tuple(found)
 

@@ -253,7 +253,10 @@ def _rod(path: Path, table: dict[str, Any]) -> Rod:
     rows = None if curvature is None else torch.tensor(curvature, dtype=DTYPE)
     masses = _masses(f"{where}.masses", table.get("masses", []), length)
     if len(pieces) > 1 or not pieces[0].uniform:
-        return Rod.of_pieces(tuple(pieces), rows, masses)
+        try:
+            return Rod.of_pieces(tuple(pieces), rows, masses)
+        except ValueError as error:
+            raise InputError(f"{where}: {error}") from error
     one = pieces[0]
     return replace(Rod.from_stiffness(length, one.K_se[0], one.K_bt[0], float(one.mass[0]), rows), masses=masses)
 

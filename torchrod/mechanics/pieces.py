@@ -210,7 +210,7 @@ def joined(pieces: tuple[Piece, ...]) -> tuple[Matrix, Matrix, Float[Tensor, ""]
         K = torch.linalg.inv(compliance)
         return 0.5 * (K + K.mT)
 
-    K_se, K_bt = mean("K_se", torch.full_like(s, 1 / L)), mean("K_bt", 3 * (L - s) ** 2 / L**3)
+    K_se, K_bt = mean("K_se", torch.full_like(s, 1 / L)), mean("K_bt", 3 * ((L - s) / L) ** 2 / L)
     total = (h.unsqueeze(-1) * coefficients["mass"] / torch.arange(1, DEGREE + 2, dtype=DTYPE)).sum()
 
     def relative(K: Matrix, name: str) -> Float[Tensor, "n 5 3 3"]:
