@@ -139,3 +139,12 @@ def test_npz_is_refused_as_csv_is(tmp_path, capsys, options):
 def test_noise_in_millimetres_is_refused(tmp_path, capsys):
     assert main(["estimate", *write(tmp_path, {"0": GOOD}), "--noise", "0.5"]) == 2
     assert "it is in metres: 1 mm is 1e-3" in capsys.readouterr().err
+
+
+def test_coordinates_too_large_to_add_are_no_markers():
+    """Once a traceback, of an empty median: 29 of 10,000 damaged files."""
+    s = torch.tensor([0.1, 0.2, 0.3])
+    whole = torch.full((1, 3, 3), 1e308, dtype=torch.float64)
+    assert too_far(Markers(s, whole, 1e-3), 0.4) == ""
+    whole[0, 0] = 1e4
+    assert "1e+04 m" in too_far(Markers(s, whole, 1e-3), 0.4)

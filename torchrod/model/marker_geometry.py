@@ -52,7 +52,8 @@ def at_origin(markers: Markers) -> Bool[Tensor, "B P"]:
 
 def too_far(markers: Markers, length: float) -> str:
     """What to say of a file of which even the nearest sample (its middle marker) is FAR rod lengths (m) off; mostly nothing."""
-    reach = markers.positions.abs().amax(-1).nanmedian(-1).values.nan_to_num(torch.inf)
+    distance = torch.where(markers.present, markers.positions.abs().amax(-1), torch.nan)  # coordinates may be too large for a sum
+    reach = distance.nanmedian(-1).values.nan_to_num(torch.inf)
     if not len(reach) or not FAR * length < float(reach.min()) < math.inf:
         return ""
     nearest = int(reach.argmin())
