@@ -24,6 +24,7 @@ from torchrod import (
     Unknowns,
     estimate,
     forward_jacobian,
+    sampled_intervals,
     solve_shape,
 )
 from torchrod.cli import main
@@ -150,6 +151,26 @@ def test_a_moment_at_the_tip_is_no_large_force():
     fit, freely = estimate(problem), estimate(problem, Settings(sized=False))
     assert fit.accepted.all() and fit.tip is not None and fit.tip_covariance is not None and freely.tip is not None
     error = fit.tip - truth
-    assert float(error.abs().max()) < 0.05 < 0.2 < float((freely.tip - truth).norm(dim=-1).median())
+    across = error[:, [0, 1, 3, 4]].abs()
+    assert float(across.max()) < 0.1 < 0.2 < float((freely.tip - truth).norm(dim=-1).median())
     inside = error.abs() < 1.96 * fit.tip_covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert float(inside.double().mean()) > 0.93
+
+
+@pytest.mark.parametrize(
+    ("force", "moment", "blind"), [((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), 2), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.5), 5)]
+)
+def test_what_acts_along_a_straight_rod_is_not_taken_for_nothing(force, moment, blind):
+    """Nothing shows it: neither the covariance nor the draws know it, where they once had it as 0 +- 0.02 N and 0.007 N m."""
+    robot = steel_rod()
+    wrench = T([*force, *moment])
+    at_tip = PointWrenches(wrench[None, None, :3], wrench[None, None, 3:], T([robot.rod.length]))
+    p = solve_shape(robot, (at_tip,), None, S, 1, 80).p
+    p = p + 4e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(0), dtype=DTYPE)
+    problem = Problem(robot, Unknowns(GaussianCoordinates(0, 0.4, robot.rod.force_scale), "wrench"), [Markers(S, p, 4e-4)])
+    fit = estimate(problem)
+    drawn = sampled_intervals(problem, fit).tip
+    assert fit.tip is not None and fit.tip_covariance is not None and drawn is not None
+    std = fit.tip_covariance[0].diagonal().sqrt()
+    assert ((fit.tip[0] - wrench).abs() < 1.96 * std)[blind] and float(std[blind]) > 0.3
+    assert float(drawn[0, blind, 0]) < wrench[blind] < float(drawn[0, blind, 1])

@@ -1,9 +1,9 @@
 """What is known whatever the hypothesis: their probabilities, and resultants and bands averaged by them.
 
 The marginal likelihood of a hypothesis is the mean weight of the draws of its posterior (estimation.draws), with priors that are
-normalized. Probabilities p_h are in its proportion, times ONE_MORE for each load. Loads are reported of the
-likeliest one; the resultant, and f(s) along the rod, which all of them have, of draws of all of them, each weighted by p_h. Source:
-Hoeting et al., Statistical Science 14 (1999) 382.
+normalized. Probabilities p_h are in its proportion, times ONE_MORE for each load. Loads are reported of the likeliest one, of a
+smooth load where no other explains the readings; the resultant, and f(s) along the rod, which all of them have, of draws of all of
+them, each weighted by p_h. Source: Hoeting et al., Statistical Science 14 (1999) 382.
 """
 
 import math
@@ -62,6 +62,7 @@ def average(
     running = _running(scores, ~held) | _running(scores, held)
     running.scatter_(1, found.evidence.choice.unsqueeze(-1), True)
     probability = torch.full_like(scores, torch.nan)
+    localized = ~held & found.evidence.loaded if found.evidence.loaded is not None else ~held
     more = [
         (OF_ANY_FORM if h else c.contacts) + (own.state.tip.size > 0)
         for h, c, own in zip(held.tolist(), candidates, problems, strict=True)
@@ -73,9 +74,10 @@ def average(
         for chunk in torch.arange(problem.batch).split(CHUNK):
             drawn = [d for h, own in enumerate(problems) for d in _drawn(own, h, found, chunk, running[chunk, h], nu)]
             probability[chunk] = _probabilities(drawn, scores[chunk], rarer)
+            likeliest = _likeliest(drawn, probability[chunk], held, localized)
             for d in drawn:
                 at = chunk[d.rows]
-                better = (probability[at].argmax(-1) == d.h) & (choice[at] != d.h) & (d.fit.accepted | ~fit.accepted[at])
+                better = (likeliest[d.rows] == d.h) & (choice[at] != d.h) & (d.fit.accepted | ~fit.accepted[at])
                 fit = fit.merged(d.fit, at, better)
                 choice[at[better]] = d.h
             for d in drawn:
@@ -121,6 +123,20 @@ def _probabilities(drawn: list[_Drawn], scores: Float[Tensor, "c H"], rarer: Flo
     doubtful = log_evidence.isnan().any(-1, keepdim=True)
     by_bic = torch.where(log_evidence == -torch.inf, -torch.inf, -0.5 * scores.nan_to_num(torch.inf, torch.inf))
     return torch.softmax(torch.where(doubtful, by_bic, log_evidence + rarer), -1)
+
+
+def _likeliest(
+    drawn: list[_Drawn], probability: Float[Tensor, "c H"], held: Bool[Tensor, " H"], localized: Bool[Tensor, " H"]
+) -> Int[Tensor, " c"]:
+    """The hypothesis to report. A load of any form explains nearly all that other loads do, and says less of it: where these
+    compete it widens bands, and is reported where none of them explains a sample.
+    """
+    explained = torch.zeros(len(probability), dtype=torch.bool)
+    for d in drawn:
+        if not held[d.h]:
+            explained[d.rows] |= d.fit.accepted
+    aside = (explained & bool(localized.any())).unsqueeze(-1) & held
+    return torch.where(aside, -1.0, probability).argmax(-1)
 
 
 def _mix(collected: Collected, chunk: Int[Tensor, " c"], drawn: list[_Drawn], probability: Float[Tensor, "c H"]) -> None:

@@ -73,8 +73,10 @@ class Evidence:
 
     @property
     def something(self) -> Float[Tensor, " B"] | None:
-        """The probability that anything pushes at all."""
-        return None if self.probability is None or self.loaded is None else self.probability[:, self.loaded].sum(-1)
+        """The probability that anything pushes at all; None where that is part of every hypothesis."""
+        if self.probability is None or self.loaded is None or bool(self.loaded.all()):
+            return None
+        return self.probability[:, self.loaded].sum(-1).clamp(max=1.0)
 
     def rival(self, sample: int) -> str:
         """A sentence on another explanation that is nearly as probable as the one that was chosen; "" where there is none."""

@@ -39,11 +39,12 @@ from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
 ANGLE_NOISE = 0.01  # rad
+ROUGHLY = 0.15  # a share: what a polynomial in the error of a stiffness follows
 EXACT = (
     "The robot is taken as exact, its {parts} too. What is only nearly known passes for a load; state it under [uncertainty] of "
     "ROBOT.toml, or calibrate it."
 )
-LATERAL = " Contacts are taken to push without drag along the rod; where they rub, state --contact-friction."
+LATERAL = "Contacts are taken to push without drag along the rod; where they rub, state --contact-friction."
 NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
 STATED = 1 / 400  # of the length: what stands for a noise that is to be estimated
 
@@ -142,7 +143,7 @@ def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
 def _unused_intervals(options: Namespace, whole: bool) -> str:
     if options.one_frame:
         return "draws of one sample cannot have the error of a base frame that all share (--one-frame)"
-    if options.contacts == "auto" or options.load_prior == "auto":
+    if options.contacts == "auto" or options.load_prior in ("auto", "smooth"):
         return ""
     return "" if whole or options.plot else "only RESULT.json, RESULT.npz and FIGURE show intervals; name one by --out or --plot"
 
@@ -177,6 +178,14 @@ def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shap
             f"--noise {stated:g} m counts as {FINEST * rod.length:.2g} m for markers: steps along the rod leave as much",
             stacklevel=2,
         )
+    own = nearly.of_a_sample
+    for kind in ("stiffness", "oval"):
+        if own is not None and getattr(own, kind) > ROUGHLY:
+            warnings.warn(
+                f"{options.robot}: uncertainty: {kind} is {getattr(own, kind):g}; above {ROUGHLY:g} intervals are too narrow now and "
+                "then, so calibrate the robot",
+                stacklevel=2,
+            )
     noises = Noises(stated, angle, base, options.curvature_noise)
     try:
         unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.of_a_sample)
@@ -211,6 +220,7 @@ def estimate(options: Namespace) -> None:
     settings = Settings(max_iterations=options.max_iterations, robust=ROBUST if options.robust else math.inf)
     sampled = _sampled(options, problem, len(candidates) > 1)
     if options.load_prior == "auto" and not sampled:  # which only draws can weigh against the others
+        warnings.warn("--load-prior auto weighs contact against distributed alone: smooth loads need draws", stacklevel=2)
         candidates = [c for c in candidates if not isinstance(c.unknowns.loads, SmoothCoordinates)]
     try:
         found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar, sampled)
@@ -220,9 +230,8 @@ def estimate(options: Namespace) -> None:
         raise InputError(f"{options.shapes}: {error}") from None
     fit = found.estimate
     print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
-    if problem.unknowns.uncertainty is None and not problem.state.tension.size:
-        parts = "tensions, friction and stiffness" if len(robot.tendons) else "stiffness"
-        print(EXACT.format(parts=parts) + LATERAL * (_friction(options) is None and options.contacts != "0"))  # noqa: T201
+    if said := _taken_as_exact(options, problem):
+        print(said)  # noqa: T201
     if options.out:
         said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
         nearly = problem.unknowns.uncertainty
@@ -233,6 +242,17 @@ def estimate(options: Namespace) -> None:
         write_result(options.out, fit, shapes.samples, robot.name, **said)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
+
+
+def _taken_as_exact(options: Namespace, problem: Problem) -> str:
+    """What is taken as known where nobody said that it is not; "" where nothing is."""
+    said = []
+    if problem.unknowns.uncertainty is None:
+        parts = ["tensions"] * (not problem.state.tension.size) + ["friction"] if len(problem.robot.tendons) else []
+        said.append(EXACT.format(parts=" and ".join([", ".join(parts), "stiffness"]) if parts else "stiffness"))
+    if _friction(options) is None and options.contacts != "0" and options.load_prior != "smooth":
+        said.append(LATERAL)
+    return " ".join(said)
 
 
 def _profile(options: Namespace, found: Analysis) -> Profile | None:

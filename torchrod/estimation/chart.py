@@ -19,7 +19,8 @@ anywhere along the rod with the same probability, and of any size,
 
 even in log |F| between the least force worth telling (f = FAINT) and the fit's own weak prior (w), F being the d components of all
 loads together: normal forces whose common size may be any. Of loads one by one, the prior would take one of two close pushes to be
-next to nothing. The unknown force and the moment at the tip have (2) each for itself. Widths, tensions and the base frame's error
+next to nothing. The unknown force and the moment at the tip have (2) each for itself, across the base's
+axis and along it. Widths, tensions and the base frame's error
 keep their priors, and so does all that a problem has a prior of its own for.
 """
 
@@ -43,6 +44,7 @@ PLACES = 24  # along the rod, at which a force is tried
 CELLS = 96  # between which the response is linear
 FAINT = 0.01  # in force and moment scales: what is weaker might as well be nothing
 STEP = 1e-3  # of the differences in dv/dy
+TORQUE_STD = 3.0  # moment scales; 4.49 EI / L, 2.2 of them, twist a straight rod off its axis
 
 
 @lru_cache(maxsize=32)
@@ -328,7 +330,10 @@ class Chart:
             faint = FAINT * min(1.0, *self.problem.robot.rod.sides)
             found.append((lateral + (self.along if loads.friction == math.inf else []), WEAK_STD, faint))
         tip = self.problem.state.tip.at
-        return found + [(list(range(first, first + 3)), TIP_STD, FAINT) for first in range(tip.start, tip.stop, 3)]
+        for first in range(tip.start, tip.stop, 3):  # across the base's axis, and along it
+            along = TORQUE_STD if first > tip.start else TIP_STD
+            found += [([first, first + 1], TIP_STD, FAINT), ([first + 2], along, FAINT)]
+        return found
 
     def fitted_prior(self, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"]:
         """What the fit's cost holds of its own prior."""

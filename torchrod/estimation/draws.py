@@ -541,13 +541,13 @@ def _less_at_the_tip(
     """
     found, tip = [], target.problem.state.tip.at
     for first in range(tip.start, tip.stop, 3):
-        at = slice(first, first + 3)
+        at = slice(first, first + 2)  # across the base's axis
         block, own = y[:, at], C[:, at, at]
         small = (block * ekf.solve_spd(own, block.unsqueeze(-1)).squeeze(-1)).sum(-1) < SURELY**2
-        size = (block.square().sum(-1) + own.diagonal(dim1=-2, dim2=-1).sum(-1)).div(3).sqrt()
+        size = (block.square().sum(-1) + own.diagonal(dim1=-2, dim2=-1).sum(-1)).div(2).sqrt()
         for share in SMALLER:
             sigma = LEAST_SIZE * (size / LEAST_SIZE).clamp(min=1.0) ** share
-            gain = ekf.solve_spd(own + torch.diag_embed(sigma.square().unsqueeze(-1).expand(-1, 3)), C[:, at]).mT
+            gain = ekf.solve_spd(own + torch.diag_embed(sigma.square().unsqueeze(-1).expand(-1, 2)), C[:, at]).mT
             gain = torch.where(small[:, None, None], gain, 0.0)
             found.append((y - (gain @ block.unsqueeze(-1)).squeeze(-1), C - gain @ C[:, at]))
     return found

@@ -3,12 +3,14 @@
 Positions hardly tell a moment about the rod's axis, and of a force and a moment together little but a part: what fits best lies
 anywhere along a valley, at forces of any size. Of all that explain the readings alike, a small wrench is the likelier one:
 
-    (1)  p(t | sigma) = N(0, sigma_F^2 1) N(0, sigma_M^2 1),    log sigma even between LEAST and TIP_STD scales
+    (1)  p(F_x, F_y | sigma_F) = N(0, sigma_F^2 1),    p(M_x, M_y | sigma_M) = N(0, sigma_M^2 1),
 
-which is (2) of estimation.chart. Fits for a row of sizes, each begun from that of the next smaller ones, stay on the branch that
-leads to no wrench at all. By Laplace's method
+log sigma even between LEAST and TIP_STD scales, which is (2) of estimation.chart. Of what acts along the base's axis a rod that is
+hardly bent tells nothing: that force keeps its weak prior, and the moment has one of TORQUE_STD, beyond which torques wind it up.
+Fits for a row of sizes, each begun from that of the next smaller ones, stay on the branch that leads to no wrench at all.
+By Laplace's method
 
-    (2)  log p(z | sigma) = -cost / 2 + log det C_yy / 2 - 3 log sigma_F - 3 log sigma_M + const
+    (2)  log p(z | sigma) = -cost / 2 + log det C_yy / 2 - 2 log sigma_F - 2 log sigma_M + const
 
 with the fit's covariance C_yy of everything but the base wrench. The fit of the best sizes is reported, and the covariance of all
 of them about it, each weighted by (2). Source: MacKay, Neural Computation 4 (1992) 415.
@@ -25,12 +27,13 @@ from torch import Tensor
 from ..model.problem import Problem
 from ..model.unknowns import TIP_STD
 from ..util.status import Status
+from .chart import TORQUE_STD
 from .result import Estimate, limit, with_covariance
 from .starts import Origin, Start, cold_start
 
 LEAST = 0.015  # force and moment scales
 SIZES = (LEAST, 0.08, 0.4, 2.0, TIP_STD)
-PER_BLOCK = 3  # entries of a force, and of a moment
+PER_BLOCK, LATERAL = 3, 2  # entries of a force, and of a moment; of them across the base's axis
 CHUNK = 512  # samples whose fits of all sizes are kept at a time
 Fitting = Callable[[Problem, Start], Estimate]
 
@@ -45,8 +48,7 @@ def sized(problem: Problem, fit: Estimate, fitting: Fitting) -> Estimate:
         return fit
     for at in (fit.status != int(Status.INVALID)).nonzero().squeeze(-1).split(CHUNK):
         part, given = problem.take(at), fit.of(at, problem.size)
-        tried = [(given, _log_evidence(part, given, (TIP_STD, TIP_STD)))]
-        best = _mixture(part, tried + _of_all_sizes(part, fitting))
+        best = _mixture(part, given, _of_all_sizes(part, fitting))
         fit = fit.merged(best, at, torch.isfinite(best.cost))
     return fit
 
@@ -70,7 +72,8 @@ def _of_all_sizes(problem: Problem, fitting: Fitting) -> list[Weighed]:
 def _fitted(problem: Problem, sizes: tuple[float, float], x: Float[Tensor, "B n"], fitting: Fitting) -> Weighed:
     """One fit, with the cost and the verdict of the weak prior, which the readings do not feel."""
     at, precision = problem.state.tip.at, problem.precision.clone()
-    precision[at] = torch.tensor([size**-2 for size in sizes for _ in range(PER_BLOCK)], dtype=x.dtype)
+    of_force, of_moment = ([size**-2] * LATERAL for size in sizes)
+    precision[at] = torch.tensor([*of_force, TIP_STD**-2, *of_moment, TORQUE_STD**-2], dtype=x.dtype)
     fit = fitting(replace(problem, prior=(problem.mean, precision)), Start.at(x, Origin.COLD))
     log_evidence = _log_evidence(problem, fit, sizes)
     extra = ((precision - problem.precision)[at] * fit.x[:, at] ** 2).sum(-1)
@@ -86,21 +89,21 @@ def _log_evidence(problem: Problem, fit: Estimate, sizes: tuple[float, float]) -
     C = fit.covariance[:, :m, :m]
     unit = C.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
     L = torch.linalg.cholesky_ex(C / unit.unsqueeze(-1) / unit.unsqueeze(-2))[0].diagonal(dim1=-2, dim2=-1)
-    value = -0.5 * fit.cost + (L.log() + unit.log()).sum(-1) - PER_BLOCK * sum(math.log(size) for size in sizes)
+    value = -0.5 * fit.cost + (L.log() + unit.log()).sum(-1) - LATERAL * sum(math.log(size) for size in sizes)
     sound = (fit.status == int(Status.CONVERGED)) & torch.isfinite(value)
     return torch.where(sound, value, -torch.inf)
 
 
-def _mixture(problem: Problem, tried: list[Weighed]) -> Estimate:
-    """The fit of the largest (2), with the covariance of all about it; the first where none has converged."""
+def _mixture(problem: Problem, given: Estimate, tried: list[Weighed]) -> Estimate:
+    """The fit of the largest (2), with the covariance of all about it; the given one where none has converged."""
     log_evidence = torch.stack([one for _, one in tried])
     best, everyone = log_evidence.argmax(0), torch.arange(problem.batch)
-    fit = tried[0][0]
-    for k, (other, _) in enumerate(tried[1:], 1):
-        fit = fit.merged(other, everyone, best == k)
+    known = torch.isfinite(log_evidence).any(0)
+    fit = given
+    for k, (other, _) in enumerate(tried):
+        fit = fit.merged(other, everyone, known & (best == k))
     weight = torch.softmax(log_evidence, 0).nan_to_num(0.0)[..., None, None]
     off = torch.stack([other.x for other, _ in tried]) - fit.x
     spread = torch.stack([other.covariance for other, _ in tried]) + off.unsqueeze(-1) * off.unsqueeze(-2)
     covariance = torch.where(weight > 0, weight * spread, 0.0).sum(0)
-    known = torch.isfinite(log_evidence).any(0)[:, None, None]
-    return with_covariance(problem, fit, torch.where(known, covariance, fit.covariance))
+    return with_covariance(problem, fit, torch.where(known[:, None, None], covariance, fit.covariance))

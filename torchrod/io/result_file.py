@@ -210,10 +210,11 @@ def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
     every = zip(evidence.names, evidence.bic[b].tolist(), evidence.foreseen[b].tolist(), strict=True)
     rows = [row for row in every if row[0] not in evidence.spare or not math.isnan(row[1])]
     by_draws: dict[str, object] = {}
-    if evidence.probability is not None and evidence.something is not None:
+    if evidence.probability is not None:
         shares = zip(evidence.names, evidence.probability[b].tolist(), strict=True)
         by_draws["probability"] = {name: plain(share) for name, share in shares if share > 0}
-        by_draws["probability_of_any_load"] = plain(float(evidence.something[b]))
+        if evidence.something is not None:
+            by_draws["probability_of_any_load"] = plain(float(evidence.something[b]))
     return {
         "chosen": evidence.names[int(evidence.choice[b])],
         **by_draws,
