@@ -182,8 +182,8 @@ def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shap
     for kind in ("stiffness", "oval"):
         if own is not None and getattr(own, kind) > ROUGHLY:
             warnings.warn(
-                f"{options.robot}: uncertainty: {kind} is {getattr(own, kind):g}; above {ROUGHLY:g} intervals are too narrow now and "
-                "then, so calibrate the robot",
+                f"{options.robot}: uncertainty: {kind} is {getattr(own, kind):g}; above {ROUGHLY:g} intervals are too narrow now "
+                "and then, so calibrate the robot",
                 stacklevel=2,
             )
     noises = Noises(stated, angle, base, options.curvature_noise)
