@@ -174,3 +174,10 @@ def test_what_acts_along_a_straight_rod_is_not_taken_for_nothing(force, moment, 
     std = fit.tip_covariance[0].diagonal().sqrt()
     assert ((fit.tip[0] - wrench).abs() < 1.96 * std)[blind] and float(std[blind]) > 0.3
     assert float(drawn[0, blind, 0]) < wrench[blind] < float(drawn[0, blind, 1])
+
+
+def test_a_batch_without_a_sample_to_fit_stays_invalid():
+    robot = steel_rod()
+    markers = Markers(S, torch.full((2, len(S), 3), math.nan, dtype=DTYPE), 1e-3)
+    fit = estimate(Problem(robot, Unknowns(GaussianCoordinates(0, 0.4, robot.rod.force_scale), "wrench"), [markers]))
+    assert not fit.accepted.any() and fit.tip is not None and fit.tip.isnan().all()

@@ -44,9 +44,10 @@ def sized(problem: Problem, fit: Estimate, fitting: Fitting) -> Estimate:
     fit: by the weak prior; a problem with a prior of its own, or without an unknown moment at the tip, keeps it. fitting: a plain
     solver.
     """
-    if problem.state.tip.size < 2 * PER_BLOCK or problem.prior is not None:
+    valid = (fit.status != int(Status.INVALID)).nonzero().squeeze(-1)
+    if problem.state.tip.size < 2 * PER_BLOCK or problem.prior is not None or not len(valid):
         return fit
-    for at in (fit.status != int(Status.INVALID)).nonzero().squeeze(-1).split(CHUNK):
+    for at in valid.split(CHUNK):
         part, given = problem.take(at), fit.of(at, problem.size)
         best = _mixture(part, given, _of_all_sizes(part, fitting))
         fit = fit.merged(best, at, torch.isfinite(best.cost))
