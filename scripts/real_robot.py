@@ -97,16 +97,17 @@ class Outcome:
     calibration: dict[str, Any]
 
 
-def _inside(value: float, interval: list[float]) -> bool:
-    return interval[0] <= value <= interval[1]
+def _inside(value: float, interval: list[float | None]) -> bool:
+    low, high = (math.nan if end is None else end for end in interval)
+    return low <= value <= high
 
 
-def whole(load: dict[str, Any]) -> tuple[float, list[float]]:
+def whole(load: dict[str, Any]) -> tuple[float, list[float | None]]:
     """|F| with what is along the rod (N), and its 95 % interval to first order, their correlation left aside; NaN where a fit has
     not converged.
     """
     across, along = load["magnitude_N"], load.get("force_axial_N", 0.0)
-    size, std = math.hypot(across, along), load.get("std", {})
+    size, std = math.hypot(across, along), {n: math.nan if v is None else v for n, v in load.get("std", {}).items()}
     spread = math.hypot(across * std.get("magnitude_N", math.nan), along * std.get("force_axial_N", 0.0)) / size
     return size, [size - 1.96 * spread, size + 1.96 * spread]
 

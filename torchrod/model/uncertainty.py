@@ -9,7 +9,7 @@ through h(x, 0) and h_k+-, of a robot whose parameter k is off by one standard d
 parameters act side by side. dh/dx follows by the same parabola. Of a stiffness that may be off by more than WIDE the slope of a
 parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through half a deviation as well, and two of
 them have a mixed term, through robots that are off by both. Where a calibration has found errors that are correlated, theta_k moves
-all of them along a column of a root of their covariance.
+all of them along a column of a root of their covariance, by a parabola.
 """
 
 import itertools
@@ -186,7 +186,11 @@ class Uncertainty:
         return std.unsqueeze(-1) * torch.linalg.cholesky(_correlation(C) + NONE * torch.eye(len(C), dtype=DTYPE))
 
     def wide(self, robot: Robot) -> tuple[bool, ...]:
-        """Of every unknown xi whether a parabola does not do for it."""
+        """Of every unknown xi whether a parabola does not do for it; errors that a calibration has mixed keep theirs, along which a
+        shape that nothing explains runs far.
+        """
+        if self.found is not None:
+            return (False,) * len(self.parameters(robot))
         stiff = [p.name.split("_")[0] in OF_STIFFNESS for p in self.parameters(robot)]
         columns = self.root(robot).mT.tolist()
         return tuple(any(s and abs(error) > WIDE for s, error in zip(stiff, errors, strict=True)) for errors in columns)
