@@ -13,7 +13,7 @@ from tests.robots import T, busy_robot, steel_rod
 from tests.test_fast import needs_compiler
 from torchrod import GaussianCoordinates, Markers, Problem, Robot, Tracker, Unknowns, cold_start, estimate
 from torchrod.estimation import at_rest as equilibrium
-from torchrod.estimation import evaluator as evaluation
+from torchrod.estimation import walk as evaluation
 from torchrod.estimation.at_rest import without_load
 from torchrod.estimation.solve import linearize
 from torchrod.mechanics.rod import Rod

@@ -30,7 +30,8 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.estimation import filter as ekf
-from torchrod.estimation.evaluator import KernelEvaluator, Run, TorchEvaluator, evaluator, kernel_serves, normal
+from torchrod.estimation.evaluator import KernelEvaluator, Run, TorchEvaluator, evaluator, normal
+from torchrod.estimation.walk import kernel_walks
 from torchrod.mechanics.lie import move
 from torchrod.mechanics.tendons import Tendon, Tendons
 from torchrod.model.problem import TIP_FORCE_STD, TIP_MOMENT_STD
@@ -116,7 +117,7 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
     r = ROBOTS[robot]()
     problem, x = case(r, FAMILIES[family](r.rod.force_scale), **FRAMES[frame])
     if family == "points" and robot in ("helical tendons and gravity", "full stiffness"):
-        assert not kernel_serves(problem)  # nodes that move under a curvature or a routing that varies: left to torch
+        assert not kernel_walks(problem)  # nodes that move under a curvature or a routing that varies: left to torch
         return
     check_agreement(problem, x)
 
@@ -135,7 +136,7 @@ def test_tensions_about_zero():
     check_agreement(problem, x)
     tendons = tuple(replace(t, tension_gain=1.5, tension_offset=0.01) for t in hanging().tendons.tendons)
     gains = replace(problem, robot=replace(problem.robot, tendons=Tendons(tendons)))
-    assert not kernel_serves(gains)  # whose errors are of tensions, not of readings
+    assert not kernel_walks(gains)  # whose errors are of tensions, not of readings
     tau, w = 1.5 * r + 0.01, 1.5 * w
     expected, pulling = torch.where(tau.abs() < w, (tau + w) ** 2 / (4 * w), tau.clamp(min=0)), gains.pulling(x)
     assert pulling is not None

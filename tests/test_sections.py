@@ -34,7 +34,8 @@ from torchrod import (
 )
 from torchrod.data.dataset import _robot_record
 from torchrod.data.shards import _robot
-from torchrod.estimation.evaluator import KernelEvaluator, evaluator, kernel_serves
+from torchrod.estimation.evaluator import KernelEvaluator, evaluator
+from torchrod.estimation.walk import kernel_walks
 from torchrod.io.robot_text import write_calibrated
 from torchrod.util.by_value import key
 
@@ -186,7 +187,7 @@ def test_the_kernel_is_the_torch_model(robot):
     assert (sums.g.sum(1) - g).abs().max() < 1e-10 * g.abs().max()
     assert (sums.A.sum(1).tril() - A.tril()).abs().max() < 1e-10 * A.abs().max()
     moving = problem_of(ROBOTS[robot], PointCoordinates(1, L, 1.0))
-    assert not kernel_serves(moving)  # nodes that move along a section that varies: left to torch
+    assert not kernel_walks(moving)  # nodes that move along a section that varies: left to torch
 
 
 def test_pieces_of_one_section_are_a_uniform_rod():

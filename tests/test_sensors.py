@@ -18,6 +18,7 @@ from torchrod import (
     Directions,
     GaussianCoordinates,
     Markers,
+    PointCoordinates,
     Problem,
     Registration,
     Settings,
@@ -31,6 +32,7 @@ from torchrod import (
     kernel,
     solve_shape,
 )
+from torchrod.estimation.evaluator import KernelEvaluator, SensorEvaluator, TorchEvaluator, evaluator
 from torchrod.model.sensors import RodState
 
 P, L = 6, 0.4
@@ -145,6 +147,32 @@ def test_the_compiled_march_is_the_torch_one(name, monkeypatch):
     for mine, definition in zip(fast, problem.linearized(x), strict=True):
         assert torch.isfinite(definition).all()
         assert (mine - definition).abs().max() <= 1e-10 * definition.abs().max()
+
+
+MOVING = ("curvature", "directions with positions")
+CASES = [(name, False) for name in (*SENSORS, *AT_THE_CURVE)] + [(name, True) for name in MOVING]
+
+
+@pytest.mark.parametrize(("name", "moving"), CASES)
+def test_the_kernel_is_the_torch_model(name, moving):
+    """h and H, to 1e-10 of their size, with all that can be unknown, and with point loads that move the nodes."""
+    nowhere = busy(markers(torch.zeros(2, P, 3)))
+    sensor = SENSORS[name](2) if name in SENSORS else AT_THE_CURVE[name](curve(nowhere, somewhere(nowhere)) + 1e-3)
+    frame = None if sensor.moved(torch.eye(3), torch.zeros(3)) is sensor else Registration()
+    if moving:
+        problem = Problem(steel_rod(), Unknowns(PointCoordinates(2, L, 1.0), "wrench", registration=frame), [sensor], steps=10)
+    else:
+        problem = busy(sensor, 0.1, frame)
+    fast, definition = evaluator(problem), TorchEvaluator(problem)
+    x = somewhere(problem)
+    x[:, 2] = T([0.3, -0.4])  # no two loads at one place
+    assert isinstance(fast, KernelEvaluator if name == "markers of own noise" else SensorEvaluator)
+    (h, H), (own, slope) = fast.linearized(x), definition.linearized(x)
+    read = problem.weights > 0
+    for mine, other in ((h, own), (H, slope), (fast.h(x), own), (fast.take(T([1])).h(x[1:]), own[1:])):
+        some = read[-len(mine) :]
+        assert (mine - other)[some].abs().max() <= 1e-10 * other[some].abs().max()
+    assert torch.allclose(fast.cost(x), definition.cost(x), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", [*SENSORS, *AT_THE_CURVE])

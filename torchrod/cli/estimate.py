@@ -11,10 +11,10 @@ from torch import Tensor
 from ..analysis.count import Hypothesis, StartFor
 from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
-from ..estimation.evaluator import kernel_serves
 from ..estimation.load_profile import Profile
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
+from ..estimation.walk import kernel_serves, kernel_walks
 from ..io import (
     RESULT_SUFFIXES,
     NearlyKnown,
@@ -38,6 +38,10 @@ from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, noise_or_auto, pos
 from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
+MOST_DRAWN, MOST_READINGS = (
+    100,
+    200,
+)  # samples, and numbers of each, of which draws are taken where torch works out what sensors read
 ANGLE_NOISE = 0.01  # rad
 ROUGHLY = 0.15  # a share: what a polynomial in the error of a stiffness follows
 EXACT = (
@@ -127,17 +131,22 @@ def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
     shown = bool((options.out and not options.out.endswith(".csv")) or options.plot)
     if options.intervals == "gaussian" or not (shown or several):
         return False
-    quick = kernel_serves(problem) and not options.one_frame
+    quick = kernel_walks(problem) and not options.one_frame
     if options.intervals == "sampled" or not quick:
         return options.intervals == "sampled"
-    if problem.batch > MOST_PROFILES:
+    few = (
+        problem.batch <= MOST_PROFILES
+        if kernel_serves(problem)
+        else problem.batch <= MOST_DRAWN and len(problem.groups) <= MOST_READINGS
+    )
+    if not few:
         warnings.warn(
             f"the intervals of {problem.batch} samples are those of the covariance"
             f"{' and the choice of loads that of the BIC' * several}, because draws would take longer than all else; "
             "--intervals sampled takes draws",
             stacklevel=2,
         )
-    return problem.batch <= MOST_PROFILES
+    return few
 
 
 def _unused_intervals(options: Namespace, whole: bool) -> str:

@@ -15,7 +15,7 @@ from ..model.problem import Problem
 from ..model.sensors import Markers
 from ..model.unknowns import Unknowns
 from ..util.by_value import Kept, key
-from .evaluator import KernelEvaluator, family_of, kernel_serves
+from .walk import Walk, family_of, kernel_walks
 
 _bare = Kept()
 
@@ -46,9 +46,9 @@ def at_rest(problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, 
     # Where tendons rub, how far they have turned at the tip is unknown as well.
     smooth = problem.robot.tendons.friction is None
     light = smooth and problem.robot.gravity.ndim == 1 and math.isfinite(_weight(problem.robot))
-    if light and family_of(plain) != "point" and kernel_serves(plain):
+    if light and family_of(plain) != "point" and kernel_walks(plain):
         increments = _increments(problem.robot) if q_tip is None else 1
-        wrench, missed, p = KernelEvaluator(plain).balance(gamma, q_tip, increments, ROUGH_TOLERANCE)
+        wrench, missed, p = Walk(plain).balance(gamma, q_tip, increments, ROUGH_TOLERANCE)
         settled = (missed <= ROUGH_TOLERANCE) & torch.isfinite(wrench).all(-1)
     if bool(settled.all()):
         return Rest(wrench, p)

@@ -32,7 +32,7 @@ from ..util.status import Status
 from ..util.threads import one_thread
 from . import filter as ekf
 from .chart import FAINT, Chart
-from .evaluator import Evaluator, KernelEvaluator, evaluator
+from .evaluator import Evaluator, KernelEvaluator, SensorEvaluator, evaluator
 from .pareto import GOOD, effective_size, smoothed
 from .result import Estimate
 
@@ -225,7 +225,7 @@ class _Target:
         chart, evaluate = self._of(index, D)
         y, log_volume = chart.back(v)
         flat, rows = y.flatten(0, 1), index.repeat_interleave(D)
-        by_walks = self.walks and isinstance(evaluate, KernelEvaluator)
+        by_walks = self.walks and isinstance(evaluate, KernelEvaluator | SensorEvaluator)
         cost, x = self._by_walks(evaluate, flat, rows) if by_walks else self._by_newton(evaluate, flat, rows)
         cost, x = cost.unflatten(0, (b, D)), x.unflatten(0, (b, D))
         if by_walks and not self.bare:
@@ -240,9 +240,9 @@ class _Target:
         self, evaluate: Evaluator, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
         """The cost, by the forward solve from tip to base: one walk without weight. With the fit's prior, but where bare."""
-        assert isinstance(evaluate, KernelEvaluator)
+        assert isinstance(evaluate, KernelEvaluator | SensorEvaluator)
         state, q_tip = self.problem.state, None if self.q_tip is None else self.q_tip[rows]
-        wrench, missed, line = evaluate.balance(y[:, state.loads.at].contiguous(), q_tip, 1, self.clamped)
+        wrench, missed, line = evaluate.walk.balance(y[:, state.loads.at].contiguous(), q_tip, 1, self.clamped)
         x = torch.cat([y, wrench / state.base.unit], -1)
         if not self.bare:
             return torch.where(missed <= self.clamped, evaluate.cost(x), torch.inf), x

@@ -23,10 +23,11 @@ from ..util.status import Status
 from ..util.threads import one_thread
 from . import checks
 from . import filter as ekf
-from .evaluator import Evaluator, Run, evaluator, kernel_serves
+from .evaluator import Evaluator, Run, evaluator
 from .result import Estimate, limit, make_estimate
 from .starts import Fate, Origin, Start, StartRule, challenged_by_cold, cold_start, in_equilibrium
 from .tip_size import sized
+from .walk import kernel_serves
 
 CHUNK = 4096  # samples per pass: what is done once per pass and iteration no longer counts, and memory stays small
 FEW = 1024  # samples for which torch's own share is done sooner on one thread

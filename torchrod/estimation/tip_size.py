@@ -16,7 +16,6 @@ with the fit's covariance C_yy of everything but the base wrench. The fit of the
 of them about it, each weighted by (2). Source: MacKay, Neural Computation 4 (1992) 415.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -59,38 +58,47 @@ Weighed = tuple[Estimate, Float[Tensor, " B"]]
 
 def _of_all_sizes(problem: Problem, fitting: Fitting) -> list[Weighed]:
     """Fits of force and moment of every size, with (2)."""
-    found: dict[tuple[int, int], Weighed] = {}
+    found: list[Weighed] = []
     x = cold_start(problem).x
     for k in range(len(SIZES)):
-        found[k, k] = _fitted(problem, (SIZES[k], SIZES[k]), x, fitting)
-        x = found[k, k][0].x.nan_to_num(0.0)
-        for smaller in range(k):
-            for sizes in ((smaller, k), (k, smaller)):
-                found[sizes] = _fitted(problem, (SIZES[sizes[0]], SIZES[sizes[1]]), x, fitting)
-    return list(found.values())
+        found += _fitted(problem, [(k, k)], x, fitting)
+        x = found[-1][0].x.nan_to_num(0.0)
+        found += _fitted(problem, [sizes for smaller in range(k) for sizes in ((smaller, k), (k, smaller))], x, fitting)
+    return found
 
 
-def _fitted(problem: Problem, sizes: tuple[float, float], x: Float[Tensor, "B n"], fitting: Fitting) -> Weighed:
-    """One fit, with the cost and the verdict of the weak prior, which the readings do not feel."""
-    at, precision = problem.state.tip.at, problem.precision.clone()
-    of_force, of_moment = ([size**-2] * LATERAL for size in sizes)
-    precision[at] = torch.tensor([*of_force, TIP_STD**-2, *of_moment, TORQUE_STD**-2], dtype=x.dtype)
-    fit = fitting(replace(problem, prior=(problem.mean, precision)), Start.at(x, Origin.COLD))
-    log_evidence = _log_evidence(problem, fit, sizes)
-    extra = ((precision - problem.precision)[at] * fit.x[:, at] ** 2).sum(-1)
+def _fitted(problem: Problem, of_sizes: list[tuple[int, int]], x: Float[Tensor, "B n"], fitting: Fitting) -> list[Weighed]:
+    """Fits of some sizes of force and moment, all begun at x, with the cost and the verdict of the weak prior, which the readings
+    do not feel.
+    """
+    at, B, parts = problem.state.tip.at, problem.batch, []
+    for force, moment in of_sizes:
+        precision = problem.precision.clone()
+        across = ([SIZES[k] ** -2] * LATERAL for k in (force, moment))
+        precision[at] = torch.tensor([*next(across), TIP_STD**-2, *next(across), TORQUE_STD**-2], dtype=x.dtype)
+        parts.append(precision)
+    if not parts:
+        return []
+    many = problem.take(torch.arange(B).repeat(len(parts)))
+    precision = torch.stack(parts).repeat_interleave(B, 0)
+    fit = fitting(replace(many, prior=(many.mean.expand_as(precision), precision)), Start.at(x.repeat(len(parts), 1), Origin.COLD))
+    each = torch.tensor([[SIZES[k] for k in sizes] for sizes in of_sizes], dtype=x.dtype).repeat_interleave(B, 0)
+    log_evidence = _log_evidence(problem, fit, each)
+    extra = ((precision - problem.precision)[:, at] * fit.x[:, at] ** 2).sum(-1)
     cost, chi2 = fit.cost - extra, fit.chi2 - extra
     explained = chi2 < torch.tensor([limit(k) for k in fit.dof.tolist()], dtype=x.dtype)
     accepted = fit.accepted | (explained & (fit.status == int(Status.CONVERGED)) & ~fit.outlier.any(-1))
-    return replace(fit, cost=cost, chi2=chi2, accepted=accepted), log_evidence
+    fit = replace(fit, cost=cost, chi2=chi2, accepted=accepted)
+    return [(fit.of(rows, problem.size), log_evidence[rows]) for rows in torch.arange(len(precision)).split(B)]
 
 
-def _log_evidence(problem: Problem, fit: Estimate, sizes: tuple[float, float]) -> Float[Tensor, " B"]:
-    """(2); -inf where the fit has not converged. cost: as the fit itself has it."""
+def _log_evidence(problem: Problem, fit: Estimate, sizes: Float[Tensor, "B 2"]) -> Float[Tensor, " B"]:
+    """(2) with sigma_F and sigma_M of each fit; -inf where it has not converged. cost: as the fit itself has it."""
     m = problem.state.base.at.start
     C = fit.covariance[:, :m, :m]
     unit = C.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).sqrt()
     L = torch.linalg.cholesky_ex(C / unit.unsqueeze(-1) / unit.unsqueeze(-2))[0].diagonal(dim1=-2, dim2=-1)
-    value = -0.5 * fit.cost + (L.log() + unit.log()).sum(-1) - LATERAL * sum(math.log(size) for size in sizes)
+    value = -0.5 * fit.cost + (L.log() + unit.log()).sum(-1) - LATERAL * sizes.log().sum(-1)
     sound = (fit.status == int(Status.CONVERGED)) & torch.isfinite(value)
     return torch.where(sound, value, -torch.inf)
 

@@ -21,6 +21,7 @@ from . import build
 
 GROUPS = 4  # of lanes that are worth a thread
 MOST_TENDONS = 16
+STATE = 13  # of a section: p, q and the wrench of mechanics.section (1)
 OUT = 4  # outputs of a perceptron's layer that are summed at a time
 FAMILIES = {"none": 0, "gaussian": 1, "paper": 2, "point": 3, "linear": 4}
 _I, _D, _P = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
@@ -122,11 +123,11 @@ class CPerceptron(ctypes.Structure):
 
 
 STRUCTURES = (CTable, CPlaces, CKnown, CLoads, CTask, CFilter, CSums, CCourse, CMarch, CPerceptron)
-CONSTANTS = {"MOST_TENDONS": MOST_TENDONS, "OUT": OUT} | FAMILIES
+CONSTANTS = {"MOST_TENDONS": MOST_TENDONS, "STATE": STATE, "OUT": OUT} | FAMILIES
 FUNCTIONS: dict[str, tuple[type, ...]] = {
     "torchrod_march": (_P, _I),
     "torchrod_normal": (_P, _P, _I, _P, _I),
-    "torchrod_measure": (_P, _P, _I, _P, _P, _I),
+    "torchrod_measure": (_P, _P, _I, _I, _P, _P, _I),
     "torchrod_posterior": (_P, _P, _P, _P, _I, _I, _I, _I, _P, _P, _I),
     "torchrod_iterate": (_P, _P, _P, _P, _I, _I),
     "torchrod_filter": (_P, _P, _I, _I),
@@ -327,9 +328,9 @@ class FitTables:
         task.loads.size = counts["gamma"]  # which has the same name within its own structure as x has in the whole
         return cls(task, counts["outputs"] - 1, held)
 
-    def with_rows(self, positions: Float[Tensor, "B P 3"], w: Float[Tensor, "B z"], nu: float) -> "FitTables":
+    def with_rows(self, positions: Float[Tensor, "B P 3"] | None, w: Float[Tensor, "B z"] | None, nu: float) -> "FitTables":
         """The same robot with the rows of other samples, where nothing else has a row per sample: a copy of the structure."""
-        rows: dict[str, Tensor | None] = {"positions": positions.contiguous(), "w": w.contiguous()}
+        rows = {name: None if x is None else x.contiguous() for name, x in (("positions", positions), ("w", w))}
         copy = CTask.from_buffer_copy(self.structure)
         copy.positions, copy.w, copy.robust = (_pointer(rows["positions"], "positions"), _pointer(rows["w"], "w"), nu)
         return FitTables(copy, self.markers, self.held | rows)
@@ -384,12 +385,13 @@ def normal_equations_now(x: Float[Tensor, "B n"], task: CTask, P: int) -> Sums:
 
 
 def measured_now(
-    x: Float[Tensor, "B n"], task: CTask, P: int, slopes: bool
+    x: Float[Tensor, "B n"], task: CTask, P: int, slopes: bool, states: bool = False
 ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"] | None]:
-    """h(x) and, where slopes are wanted, dh/dx."""
+    """h(x) and, where slopes are wanted, dh/dx; with `states`, instead of the markers' rows, STATE for each place and the tip."""
     (B, n), x = x.shape, x.contiguous()
-    h, H = x.new_empty(B, 3 * P + 6), x.new_empty(B, 3 * P + 6, n) if slopes else None
-    _run("torchrod_measure", B, ctypes.byref(task), _pointer(x, "x"), B, _pointer(h, "h"), _pointer(H, "H"))
+    Z = (STATE * (P + 1) if states else 3 * P) + 6
+    h, H = x.new_empty(B, Z), x.new_empty(B, Z, n) if slopes else None
+    _run("torchrod_measure", B, ctypes.byref(task), _pointer(x, "x"), B, int(states), _pointer(h, "h"), _pointer(H, "H"))
     return h, H
 
 

@@ -75,11 +75,11 @@ void torchrod_normal(const Task* f, const double* x, int64_t count, const Sums* 
     });
 }
 
-// h (b, Z) of samples at x (b, n), and with H not null dh/dx (b, Z, n).
-void torchrod_measure(const Task* f, const double* x, int64_t count, double* h, double* H, int64_t threads) {
-    const int64_t n = f->size, Z = 3 * (f->known.outputs - 1) + PLAIN;
+// h (b, Z) of samples at x (b, n), and with H not null dh/dx (b, Z, n): of the markers or, where `states` is not 0, of the sections.
+void torchrod_measure(const Task* f, const double* x, int64_t count, int64_t states, double* h, double* H, int64_t threads) {
+    const int64_t n = f->size, Z = rows_of(*f, states);
     in_groups(count, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
-        const Measured m = measure(*f, lanes, [&](int64_t j) { return fetch({x, n}, lanes, j); }, H != nullptr, room);
+        const Measured m = measure(*f, lanes, [&](int64_t j) { return fetch({x, n}, lanes, j); }, H != nullptr, room, states);
         for (int64_t l = 0; l < lanes.count; l++)
             for (int64_t z = 0; z < Z; z++) {
                 const int64_t to = lanes.sample[l] * Z + z;

@@ -54,6 +54,6 @@ inline std::string structures_and_constants() {
 #undef F
 #undef BEGIN
 #undef END
-    return text + CONSTANT("MOST_TENDONS", MOST_TENDONS) + CONSTANT("OUT", OUT) + CONSTANT("none", NONE) + CONSTANT("gaussian", GAUSSIAN) +
+    return text + CONSTANT("MOST_TENDONS", MOST_TENDONS) + CONSTANT("STATE", STATE) + CONSTANT("OUT", OUT) + CONSTANT("none", NONE) + CONSTANT("gaussian", GAUSSIAN) +
            CONSTANT("paper", PAPER) + CONSTANT("point", POINT) + CONSTANT("linear", LINEAR);
 }

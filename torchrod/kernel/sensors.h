@@ -65,9 +65,9 @@ struct Room {
     std::vector<V> local, moves, rows, line, tension, tangents;
 };
 
-struct Measured {  // rows (3 P + 6, 1 + n): h, then dh/dx; line (P, 3): the centre line in the rod's own frame
+struct Measured {  // rows (Z, 1 + n): h, then dh/dx; line (P, 3): the centre line in the rod's own frame
     V *rows, *line;
-    int64_t width, tip;  // the first row of c
+    int64_t width, tip;  // the first row of c, the last six
     V& h(int64_t z) const { return rows[z * width]; }
     V* H(int64_t z) const { return rows + z * width + 1; }
 };
@@ -137,12 +137,22 @@ template <class X> struct Show {
             put(here, 3 * p, f.size - 2 * PLAIN + 3 + k, splat(f.angle_unit) * matvec(motion.dR[k], r));
         }
     }
+    // The section's own state, of which torch works out what other sensors read.
+    void state(int64_t p, Mask here) const {
+        for (int c = 0; c < STATE; c++) {
+            const int64_t z = STATE * p + c;
+            to.h(z) = select(here, y[c], to.h(z));
+            for (int64_t j = 0; j < g.tangents; j++) {
+                V& at = to.H(z)[column(j)];
+                at = select(here, dy[j * f.known.width() + c], at);
+            }
+        }
+    }
     void tip(Mask here) const {
-        const int64_t P = f.known.outputs - 1;
         const V* l = g.local_at(3 * f.known.steps);
         const V3 q = part(y + 3), back = V3{} - q;
         for (int half = 0; half < 2; half++) {
-            const int64_t z = 3 * P + 3 * half;
+            const int64_t z = to.tip + 3 * half;
             V3 c = part(y + 7 + 3 * half), unknown{};
             V J[12];
             if (l) c = c - (half ? V3{l[4], -l[3], V{}} : part(l));
@@ -167,17 +177,25 @@ template <class X> struct Show {
     }
 };
 
-// h and H of the samples in the lanes. x(j): entry j of their states. Without `slopes` h alone.
-template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool slopes, Room& room) {
+// How many rows there are: three for each marker, or the states at every output and at the tip, and c.
+inline int64_t rows_of(const Task& f, bool states) {
+    return (states ? STATE * f.known.outputs : 3 * (f.known.outputs - 1)) + PLAIN;
+}
+
+// h and H of the samples in the lanes. x(j): entry j of their states. Without `slopes` h alone. states: instead of the markers, the
+// states of the sections, in the rod's own frame.
+template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool slopes, Room& room, bool states = false) {
     const Known& m = f.known;
     const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
     const int64_t width = slopes ? 1 + n : 1;
-    room.rows.assign((3 * P + PLAIN) * width, V{});
+    const int64_t Z = rows_of(f, states);
+    room.rows.assign(Z * width, V{});
     room.line.assign(3 * P, V{});
-    const Measured to{room.rows.data(), room.line.data(), width, 3 * P};
-    const Group g = group_of(f, lanes, x, slopes, room);
+    const Measured to{room.rows.data(), room.line.data(), width, Z - PLAIN};
+    Group g = group_of(f, lanes, x, slopes, room);
+    g.turning |= states;
     Motion motion;
-    if (f.registration) {
+    if (f.registration && !states) {
         V translation[3], turn[3];
         for (int i = 0; i < 3; i++) {
             translation[i] = f.length_unit * x(n - 2 * PLAIN + i);
@@ -197,8 +215,9 @@ template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool
     }
     const Show<X> show{f, g, x, motion, to, y, room.tangents.data()};
     walk(g, y, room.tangents.data(), false, [&](int64_t p, Mask here) {
-        if (p < P) show.marker(p, here);
-        else show.tip(here);
+        if (states) show.state(p, here);
+        else if (p < P) show.marker(p, here);
+        if (p == P) show.tip(here);
     });
     return to;
 }

@@ -359,9 +359,30 @@ class Problem(Float64):
         H, _ = near_zero(H, (one for _, one in off), theta, self.wide)
         return h, torch.cat([H[..., :at], torch.stack(slopes, -1), H[..., at:]], -1)
 
+    def read(self, states: Float[Tensor, "B P1 13"], x: Float[Tensor, "B n"]) -> Float[Tensor, "B rows"]:
+        """What the sensors read of a section's states [p (m), q, wrench (N, N m)] at their arc lengths and at the tip, in its own
+        frame.
+        """
+        p, q, wrench = states.split([3, 4, 6], -1)
+        return self._rows(p[..., :-1, :], q[..., :-1, :], wrench[..., :-1, :], q[..., -1, :], x)
+
     def _read(self, shape: Shape, x: Float[Tensor, "... n"]) -> Float[Tensor, "... z"]:
-        """What the sensors read of a shape."""
-        state, p, q = self.state, shape.p, shape.q
+        """What the sensors read of a shape, and c."""
+        c = shape.tip_residual
+        if self.state.tip.size:
+            tip = self.state.tip_wrench(x)
+            c = c - unrotate(shape.tip_q.unsqueeze(-2), tip.unflatten(-1, (2, 3))).flatten(-2)
+        return torch.cat([self._rows(shape.p, shape.q, shape.wrench, shape.tip_q, x), c], -1)
+
+    def _rows(
+        self,
+        p: Float[Tensor, "... P 3"],
+        q: Float[Tensor, "... P 4"],
+        wrench: Float[Tensor, "... P 6"],
+        tip_q: Float[Tensor, "... 4"],
+        x: Float[Tensor, "... n"],
+    ) -> Float[Tensor, "... rows"]:
+        state, own = self.state, torch.cat([p, q, wrench[..., :6]], -1)
         if state.registration.size:
             zeta = state.registration.of(x)
             p, q = move(zeta, p), product(exponential(zeta[..., 3:]).unsqueeze(-2), q)
@@ -370,16 +391,13 @@ class Problem(Float64):
         rows, first, alpha, tip = [], 0, state.base.of(x), state.tip_wrench(x)
         for sensor in self.sensors:
             at = slice(first, first + len(sensor.s))
-            strains = partial(self._strains, shape, x, at)
-            rows.append(sensor.predict(RodState(p[..., at, :], q[..., at, :], alpha, tip, shape.tip_q, strains)))
+            strains = partial(self._strains, own[..., at, :], x, at)
+            rows.append(sensor.predict(RodState(p[..., at, :], q[..., at, :], alpha, tip, tip_q, strains)))
             first = at.stop
-        c = shape.tip_residual
-        if state.tip.size:
-            c = c - unrotate(shape.tip_q.unsqueeze(-2), tip.unflatten(-1, (2, 3))).flatten(-2)
-        return torch.cat([*rows, c], -1)
+        return torch.cat(rows, -1)
 
-    def _strains(self, shape: Shape, x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
-        """v (-) and u (1/m) at the arc lengths `at` of all sensors', taken from the rates of mechanics.section."""
+    def _strains(self, y: Float[Tensor, "... P 13"], x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
+        """v (-) and u (1/m) at the arc lengths `at` of all sensors', from the rates of mechanics.section at the states y."""
         loads, robot = self.unknowns.loads.loads(x[..., self.state.loads.at]), self.robot
         if robot.tendons.friction is not None:
             raise ValueError(
@@ -387,8 +405,7 @@ class Problem(Float64):
                 "[[tendons]], or leave those readings out"
             )
         table = stage_table(robot, loads, self.pulling(x), Places(self.s[at])).stage(0)
-        q = shape.q[..., at, :]
-        y = torch.cat([shape.p[..., at, :], q, shape.wrench[..., at, :]], -1)
+        q = y[..., 3:7]
         rate = derivative(Section.of(robot.rod.K_se, robot.rod.K_bt), y, table)
         return unrotate(q, rate[..., :3]), 2 * product(conjugate(q), rate[..., 3:7])[..., :3]
 

@@ -83,7 +83,7 @@ class CentreLine(Float64):
         self, z: Float[Tensor, "... M 3"], p: Float[Tensor, "... K 3"], m: Float[Tensor, "... K 3"]
     ) -> tuple[Int[Tensor, "... M"], Float[Tensor, "... M"]]:
         """Which piece of the curve every point is nearest to, and where on it, from 0 to 1."""
-        square = (z.unsqueeze(-2) - p.unsqueeze(-3)).square().sum(-1)
+        square = p.square().sum(-1).unsqueeze(-2) - 2 * z @ p.mT  # of the distances, less |z|^2, which all places share
         k = self._in_order(square) if self.ordered else square.argmin(-1)
         k = torch.where(self._at_ends & (torch.arange(self._points) == 0), 0, k)
         k = torch.where(self._at_ends & (torch.arange(self._points) > 0), len(self.s) - 1, k)
