@@ -13,7 +13,7 @@ from tests.robots import T, busy_robot, steel_rod
 from tests.test_fast import needs_compiler
 from torchrod import GaussianCoordinates, Markers, Problem, Robot, Tracker, Unknowns, cold_start, estimate
 from torchrod.estimation import at_rest as equilibrium
-from torchrod.estimation import walk as evaluation
+from torchrod.estimation import walk
 from torchrod.estimation.at_rest import without_load
 from torchrod.estimation.solve import linearize
 from torchrod.mechanics.rod import Rod
@@ -144,8 +144,8 @@ def test_markers_that_go_missing(way):
 def test_single_precision_is_worked_out_once(monkeypatch):
     """Arc lengths and positions as a camera gives them, made float64 anew for each call."""
     robot, asked = Robot(busy_robot().rod, gravity=T([0.0, -9.81, 0.0])), []
-    layout, rest = evaluation._layout, equilibrium.at_rest
-    monkeypatch.setattr(evaluation, "_layout", lambda *a: asked.append("layout") or layout(*a))
+    layout, rest = walk._layout, equilibrium.at_rest
+    monkeypatch.setattr(walk, "_layout", lambda *a: asked.append("layout") or layout(*a))
     monkeypatch.setattr(equilibrium, "at_rest", lambda *a: asked.append("rest") or rest(*a))
 
     def posed_again() -> Problem:

@@ -198,7 +198,7 @@ def test_the_other_solutions_of_a_tip_pose():
     tip = T([0.0, -0.05, 0.4]) + offsets
     sensors = [Markers(torch.full((4,), 0.5), tip.unsqueeze(0), 1e-4, offsets)]
     problem = Problem(robot, Unknowns(GaussianCoordinates(0, 0.5, rod.force_scale), tip="wrench"), sensors)
-    assert "explained as well by force" in analyze(problem).message(0)
+    assert "explained as well by a force" in analyze(problem).message(0)
     found = analyze(problem, settings=Settings(sized=False))  # of the sizes of the wrench the one in the plane may be the best
     assert found.estimate.accepted.all() and found.estimate.tip is not None
     mirrored = found.estimate.tip[0] * T([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
@@ -207,7 +207,7 @@ def test_the_other_solutions_of_a_tip_pose():
     nearest = int((wrenches - mirrored).norm(dim=-1).argmin())
     assert torch.allclose(wrenches[nearest], mirrored, atol=1e-2 * float(mirrored.abs().max()))
     assert abs(others[nearest].chi2 - float(found.estimate.chi2)) < 0.1
-    assert "explained as well by force" in found.message(0)
+    assert "explained as well by a force" in found.message(0)
     spread = replace(sensors[0], s=T([0.2, 0.3, 0.4, 0.5]))
     assert not read_at_few_places(replace(problem, sensors=[spread])).any()
 

@@ -1,4 +1,4 @@
-"""Other equilibria that explain the same readings, where a rod is read at few places.
+"""Other equilibria that explain the same readings, where a rod is read at few places, or pushed beside an unknown force at its tip.
 
 A tip pose alone, say, fits a rod that bends to either side. The fit that is reported is one of them; the others are looked for from
 loads, and wrenches at the tip, of several sizes and directions, and told with their cost.
@@ -11,26 +11,21 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..estimation.result import Estimate, limit
+from ..estimation.other_fits import beside_the_tip, other_fits, pushes_elsewhere, shape_at
+from ..estimation.result import Estimate
 from ..estimation.solve import Settings, estimate_each
-from ..estimation.starts import Origin, Start, onward
+from ..estimation.starts import Start
 from ..mechanics.loads import PointWrenches
-from ..mechanics.statics import shape_from_base, solve_shape
+from ..mechanics.statics import solve_shape
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
-from ..util.status import Status
 from ..util.threads import one_thread
 
 FEW_PLACES = 3  # along the rod: with more of them a rod that is fitted is as a rule the only one
 TIP_SIZES = (1.0, 3.0)  # force and moment scales of the starts
 SAME = 1e-3  # of the length: fits whose rods lie closer together than that everywhere are one
-NODES = 21
-ROUNDS, ITERATIONS = 6, 4  # of the way there, after each of which doubles are dropped: fits that are accepted have arrived
 CHUNK = 256  # samples at a time
-AT_ONCE = 1024  # fits, whose working set then stays in the cache
-WRONG = 100.0  # times what is accepted: a start that is as far as that from the readings is given up,
-STUCK = 0.8  # where a round has not lowered its cost to this share of it
 
 
 @dataclass(frozen=True)
@@ -43,6 +38,11 @@ class Solution:
     tip: Float[Tensor, " 6"] | None
 
     @property
+    def push(self) -> bool:
+        """Whether something pushes beside a force at the tip."""
+        return self.tip is not None and bool(self.force.any())
+
+    @property
     def said(self) -> str:
         """What acts on the rod in it."""
         parts = [
@@ -50,7 +50,7 @@ class Solution:
         ]
         if self.tip is not None:
             force, moment = (", ".join(f"{v:.3g}" for v in part.tolist()) for part in (self.tip[:3], self.tip[3:]))
-            parts.append(f"force ({force}) N and moment ({moment}) N m at the tip")
+            parts.append(f"a force of ({force}) N{f' and a moment of ({moment}) N m' * bool(self.tip[3:].any())} at the tip")
         return " and ".join(parts)
 
 
@@ -106,16 +106,16 @@ def other_solutions(
 ) -> tuple[tuple[Solution, ...], ...]:
     """For every sample of a fit the other equilibria that explain its readings too (their chi^2 is accepted), cheapest first.
 
-    Only of samples that were read at few places, and that are accepted. parts: the unknowns of each sample, as in Analysis. All
-    samples from all starts at once, a few iterations on coarse steps at a time; of those of a sample that have come to the same
-    rod one goes on, and none to that of the fit. What is not near the readings in the end is given up, the rest is fitted.
+    Only of samples that are accepted and that were read at few places, or whose fit has a push beside an unknown force at the tip
+    (estimation.other_fits). parts: the unknowns of each sample, as in Analysis.
     """
     settings = replace(settings or Settings(), restarts=(), basins=0, sized=False)
     found: list[tuple[Solution, ...]] = [()] * problem.batch
-    few = read_at_few_places(problem) & fit.accepted
+    few = read_at_few_places(problem)
     for unknowns, index in parts:
         own = problem.of(unknowns)
-        for rows in index[few[index]].split(CHUNK) if bool(few[index].any()) else ():
+        asked = index[fit.accepted[index] & (few[index] | beside_the_tip(own))]
+        for rows in asked.split(CHUNK) if len(asked) else ():
             with one_thread(True):  # many small tensors, which several threads wait for longer than they work at
                 each = _others(own.take(rows), fit.x[rows, : own.size], settings)
             for b, others in zip(rows.tolist(), each, strict=True):
@@ -125,54 +125,21 @@ def other_solutions(
 
 def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings) -> list[tuple[Solution, ...]]:
     """Of samples whose fits are x."""
-    x0, of = _starts(problem)
-    known, apart = _rods(problem, x), SAME * problem.robot.rod.length
-    enough = WRONG * torch.tensor([limit(n) for n in problem.seen.tolist()], dtype=DTYPE)
-    before = x0.new_full((len(x0),), torch.inf)
-    for k in range(ROUNDS):
-        if not len(of):
-            return [()] * problem.batch
-        parts = [onward(problem.take(of[at]), x0[at], ITERATIONS) for at in torch.arange(len(of)).split(AT_ONCE)]
-        x0, cost = (torch.cat(values) for values in zip(*parts, strict=True))
-        kept = _different(_rods(problem.take(of), x0), cost, of, known, apart)
-        hopeful = (cost < enough[of]) | ((cost < STUCK * before) & (k < ROUNDS - 1))
-        kept = kept[hopeful[kept]]
-        x0, of, before = x0[kept], of[kept], cost[kept]
-    if not len(of):
-        return [()] * problem.batch
-    tried = estimate_each(problem.take(of), settings, Start.at(x0, Origin.ELSEWHERE))
-    good = tried.accepted & (tried.status == int(Status.CONVERGED))
-    kept = _different(_rods(problem.take(of), tried.x), torch.where(good, tried.chi2, torch.inf), of, known, apart)
-    kept = kept[good[kept]]
+
+    def fitting(problem: Problem, start: Start) -> Estimate:
+        return estimate_each(problem, settings, start)
+
+    def rods(problem: Problem, x: Float[Tensor, "N n"]) -> Float[Tensor, "N K 3"]:
+        return shape_at(problem, x).p
+
+    if beside_the_tip(problem):
+        others = pushes_elsewhere(problem, x, fitting)
+    else:
+        others = other_fits(problem, x, *_starts(problem), rods, SAME * problem.robot.rod.length, fitting)
     found: list[list[Solution]] = [[] for _ in range(problem.batch)]
-    for c in kept[tried.chi2[kept].argsort(stable=True)].tolist():
-        tip = None if tried.tip is None else tried.tip[c]
-        found[int(of[c])].append(Solution(float(tried.chi2[c]), tried.force[c], tried.location[c], tip))
+    if others is not None:
+        tried, of = others
+        for c, b in enumerate(of.tolist()):
+            tip = None if tried.tip is None else tried.tip[c]
+            found[b].append(Solution(float(tried.chi2[c]), tried.force[c], tried.location[c], tip))
     return [tuple(others) for others in found]
-
-
-def _different(
-    rods: Float[Tensor, "N K 3"], cost: Float[Tensor, " N"], of: Int[Tensor, " N"], known: Float[Tensor, "B K 3"], apart: float
-) -> Int[Tensor, " k"]:
-    """Which rods to keep: of those of a sample that are no farther apart than that (m) the cheapest, none like its known one."""
-    kept = []
-    for b in of.unique().tolist():
-        mine = (of == b).nonzero().squeeze(-1)
-        mine = mine[cost[mine].argsort(stable=True)]
-        p = rods[mine]
-        double = ((p - known[b]).norm(dim=-1).amax(-1) <= apart).tolist()
-        near = ((p.unsqueeze(1) - p).norm(dim=-1).amax(-1) <= apart).numpy()
-        chosen: list[int] = []
-        for i, row in enumerate(mine.tolist()):
-            if not double[i] and not near[i, chosen].any():
-                chosen.append(i)
-                kept.append(row)
-    return torch.tensor(kept, dtype=torch.int64)
-
-
-def _rods(problem: Problem, x: Float[Tensor, "B n"]) -> Float[Tensor, "B N 3"]:
-    """The centre lines (m) at other places than the sensors'."""
-    state, robot = problem.state, problem.robot
-    along = torch.linspace(0, robot.rod.length, NODES, dtype=DTYPE)
-    loads = problem.unknowns.loads.loads(x[:, state.loads.at]) if state.loads.size else ()
-    return shape_from_base(robot, loads, state.base.of(x), problem.pulling(x), along, problem.steps, differentiable=False).p

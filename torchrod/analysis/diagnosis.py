@@ -123,9 +123,9 @@ class Diagnosis:
         if self.others and (others := self.others[sample]):
             told = "; by ".join(f"{other.said} (chi2 = {other.chi2:.3g})" for other in others[:MOST_TOLD])
             more = f"; and by {len(others) - MOST_TOLD} more" if len(others) > MOST_TOLD else ""
-            said.append(
-                f"The rod is read at few places, and its readings are explained as well by {told}{more}; add sensors along it."
-            )
+            pushed = any(other.push for other in others)
+            remedy = "measure the force at the tip, or what pushes" if pushed else "add sensors along the rod"
+            said.append(f"The readings are explained as well by {told}{more}; {remedy}.")
         if self.rivals and self.rivals[sample]:
             said.append(self.rivals[sample])
         return " ".join(said)

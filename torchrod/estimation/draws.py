@@ -33,8 +33,10 @@ from ..util.threads import one_thread
 from . import filter as ekf
 from .chart import FAINT, Chart
 from .evaluator import Evaluator, KernelEvaluator, SensorEvaluator, evaluator
+from .other_fits import beside_the_tip, place_and_tip, pushes_elsewhere
 from .pareto import GOOD, effective_size, smoothed
 from .result import Estimate
+from .solve import Settings, solver_of
 
 DRAWS = 512  # a power of two
 ROWS = 32768  # draws evaluated at a time
@@ -47,6 +49,8 @@ SURELY = 5.0  # standard deviations
 LEAST_SIZE = 1.5 * FAINT  # of forces and moments at the tip
 SMALLER = (0.0, 0.5)  # of the way, in logarithms, from there to the fit's
 FARTHEST = 4.0  # |eta| of the proposal's centre
+MOST_OTHERS = 2  # fits of a sample
+HARDLY = 0.02  # of the draws: of a fit with fewer nobody is told whether its weights can be trusted
 ENOUGH = 0.1  # of the draws: a smaller effective size asks for another round
 PLENTY = 0.3  # with so many, a k-hat up to 1 will do
 ROUNDS = 3  # of matched proposals
@@ -316,8 +320,11 @@ class _Found:
     method: Int[Tensor, " b"]
 
     def put(self, rows: Int[Tensor, " c"], other: "_Found") -> None:
-        for name in ("x", "log_weight", "k_hat", "ess", "log_evidence", "method"):
-            getattr(self, name)[rows] = getattr(other, name)
+        for f in fields(_Found):
+            getattr(self, f.name)[rows] = getattr(other, f.name)
+
+    def take(self, rows: Int[Tensor, " c"]) -> "_Found":
+        return _Found(*(getattr(self, f.name)[rows] for f in fields(_Found)))
 
 
 def _importance(target: _Target, first: list[tuple["_Proposal | _OnGrid", int]], count: int) -> _Found:
@@ -553,6 +560,57 @@ def _less_at_the_tip(
     return found
 
 
+def _drawn(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int) -> _Found:
+    """Draws about the fits x with covariances C."""
+    target = _Target(problem, x, C, nu)
+    return _importance(target, _about(target, C, draws), draws)
+
+
+def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int) -> _Found:
+    """The same about all fits of a push beside an unknown force at the tip, each by the evidence of what was drawn about it.
+
+    The equilibria about one fit are no branch of those about another: what is drawn about the one hardly finds the other. Where
+    it does, a fit has its draws twice; the evidence counts of each run what is nearest to its own fit.
+    """
+    found = _drawn(problem, x, C, nu, draws)
+    others = pushes_elsewhere(problem, x, solver_of(Settings(restarts=(), basins=0, sized=False)))
+    if others is None:
+        return found
+    fit, of = others
+    turn = torch.arange(len(of)) - torch.searchsorted(of, of)  # 0 for the cheapest of each sample
+    runs, centres = [found], [place_and_tip(problem, x)]
+    for k in range(min(MOST_OTHERS, int(turn.max()) + 1)):
+        rows = of[turn == k]
+        own = fit.of((turn == k).nonzero().squeeze(-1), problem.size)
+        run = found.take(torch.arange(len(x)))
+        run.log_weight[:], run.log_evidence[:] = -math.inf, -math.inf  # of samples without another fit
+        run.put(rows, _drawn(problem.take(rows), own.x, own.covariance, nu, draws))
+        runs.append(run)
+        centres.append(torch.full_like(centres[0], torch.inf).index_copy(0, rows, place_and_tip(problem, own.x)))
+    evidence = torch.stack([run.log_evidence.nan_to_num(-math.inf) for run in runs], 1)
+    log_weight = torch.cat([run.log_weight for run in runs], 1).unflatten(1, (len(runs), draws))
+    many = torch.stack([run.x for run in runs], 1)
+    to = (place_and_tip(problem, many).unsqueeze(3) - torch.stack(centres, 1)[:, None, None]).norm(dim=-1).nan_to_num(torch.inf)
+    at_home = to.argmin(-1) == torch.arange(len(runs)).unsqueeze(-1)
+    share = torch.where(at_home, log_weight.exp(), 0.0).sum(-1)
+    total = torch.where(torch.isfinite(evidence).sum(1) > 1, (evidence + share.log()).logsumexp(1), evidence[:, 0])
+    p = torch.softmax(evidence, 1)
+    pick = systematic((p.unsqueeze(-1) * log_weight.exp()).flatten(1), draws)
+    told = torch.stack([run.k_hat for run in runs], 1).masked_fill(p < HARDLY, -math.inf).amax(1)
+    ess = 1 / (p.square() / torch.stack([run.ess for run in runs], 1)).sum(1)
+    joined = _Found(
+        picked(many.flatten(1, 2), pick),
+        torch.full_like(found.log_weight, -math.log(draws)),
+        told,
+        ess.clamp(max=draws),
+        total,
+        torch.stack([run.method for run in runs], 1).amax(1),
+    )
+    several = of.unique()
+    found.put(several, joined.take(several))
+    return found
+
+
 def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu: float = math.inf) -> Draws:
     """Draws of the posterior of x of every sample that has converged: see the module.
 
@@ -577,11 +635,11 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
             if not len(rows):
                 continue
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
-            C = estimate.covariance[rows]
-            target = _Target(part, estimate.x[rows], C, nu)
-            found = _importance(target, _about(target, C, draws), draws)
+            drawn = _about_all_fits if beside_the_tip(part) else _drawn
+            found = drawn(part, estimate.x[rows], estimate.covariance[rows], nu, draws)
             x[rows], weight[rows] = found.x, found.log_weight.exp()
-            alike = math.lgamma(len(target.chart.places) + 1)  # as many orders of the loads, of which the draws have one
+            loads = len(Chart(part, found.x[:, 0], None).places)
+            alike = math.lgamma(loads + 1)  # as many orders of the loads, of which the draws have one
             k_hat[rows], ess[rows], evidence[rows] = found.k_hat, found.ess, found.log_evidence + alike
             method[rows] = found.method
     return Draws(problem, x, weight, k_hat, ess, evidence, method)

@@ -24,6 +24,7 @@ from ..util.threads import one_thread
 from . import checks
 from . import filter as ekf
 from .evaluator import Evaluator, Run, evaluator
+from .other_fits import cheapest
 from .result import Estimate, limit, make_estimate
 from .starts import Fate, Origin, Start, StartRule, challenged_by_cold, cold_start, in_equilibrium
 from .tip_size import sized
@@ -385,6 +386,7 @@ def estimate_each(
             chunk = problem if len(index) == B else problem.take(index)
             fit = solve(chunk, _begin(start, chunk, index, B), progress)
             fit = sized(chunk, fit, plain) if settings.sized else fit
+            fit = cheapest(chunk, fit, plain) if settings.basins else fit
             parts.append(_stable(chunk, _followed(chunk, fit, settings)))
     return Estimate.cat(parts)
 

@@ -171,7 +171,10 @@ def _increasing(path: Path, s: np.ndarray, offsets: np.ndarray | None, sample: s
     """s must increase; markers at one arc length are told apart by their offsets only."""
     if (back := np.flatnonzero(np.diff(s) < 0)).size:
         i = int(back[0])
-        raise InputError(f"{path}: sample {sample}: s = {s[i + 1]:g} m follows {s[i]:g} m; sort the markers so that s increases")
+        again = "; if the next shape begins there, number the shapes in a column 'sample'" if s[i + 1] <= s[0] else ""
+        raise InputError(
+            f"{path}: sample {sample}: s = {s[i + 1]:g} m follows {s[i]:g} m; sort the markers so that s increases{again}"
+        )
     places = s[:, None] if offsets is None else np.column_stack([s, offsets])
     unique, count = np.unique(places, axis=0, return_counts=True)
     if (count > 1).any():
