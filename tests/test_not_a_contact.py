@@ -1,5 +1,7 @@
 """What two lateral contacts are made of that are none: a force at the tip, and a section that is not what the file says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -70,3 +72,106 @@ def test_a_couple_is_said_to_be_no_contact(contacts: str | int, least: int):
     said = [a.message(b) for b in range(len(cases))]
     assert sum("not a contact near" in words for words in said) >= least, said
     assert not any("try more --contacts" in words for words in said if "not a contact" in words)
+
+
+def robots() -> dict[str, tr.Robot]:
+    """Rods of other lengths, sections and weights, and robots with tendons."""
+    around = [(0.006, 0.0), (-0.003, 0.0052), (-0.003, -0.0052)]
+    held = tr.Rod.circular(0.3, 0.0012, 207e9, 79e9, 0.02)
+    flat = tr.Rod.from_stiffness(0.25, torch.diag(T([2e5, 2e5, 6e5])), torch.diag(T([0.03, 0.003, 0.005])))
+    down, aside = T([0.0, 0.0, -9.81]), T([0.0, -9.81, 0.0])
+    return {
+        "steel": steel_rod(),
+        "nitinol": tr.Robot(tr.Rod.circular(0.15, 0.0009, 60e9, 23e9, 0.004), gravity=aside),
+        "long": tr.Robot(tr.Rod.circular(1.0, 0.004, 70e9, 26e9, 0.034), gravity=aside),
+        "flat": tr.Robot(flat),
+        "one tendon": tr.Robot(held, tr.Tendons((tr.Tendon.straight(0.006, 0.0, 0.3),)), down),
+        "three tendons": tr.Robot(held, tr.Tendons(tuple(tr.Tendon.straight(x, y, 0.3) for x, y in around)), down),
+    }
+
+
+def drawn(low: float, high: float, count: int, random: torch.Generator) -> torch.Tensor:
+    return low + (high - low) * torch.rand(count, generator=random)
+
+
+def pushed(
+    robot: tr.Robot, loads: tuple, tension: torch.Tensor | None, random: torch.Generator, B: int
+) -> tuple[tr.Problem, torch.Tensor]:
+    """Markers with a noise of a thousandth of the length, of the robot without what is not in its file, and which were solved."""
+    L = robot.rod.length
+    s = torch.linspace(L / 20, L, 20)
+    shape = tr.solve_shape(robot, loads, tension, s, B)
+    solved = shape.status == 0
+    p = shape.p[solved] + 1e-3 * L * torch.randn(shape.p[solved].shape, generator=random)
+    unknowns = tr.Unknowns(tr.GaussianCoordinates(1, L, robot.rod.force_scale))
+    return tr.Problem(robot, unknowns, [tr.Markers(s, p, 1e-3 * L)], None if tension is None else tension[solved]), solved
+
+
+def lateral(robot: tr.Robot, B: int, random: torch.Generator) -> torch.Tensor:
+    """Forces (B, 1, 3) of 0.5 to 1.5 force scales."""
+    size, turn = robot.rod.force_scale * drawn(0.5, 1.5, B, random), drawn(0, 6.283, B, random)
+    return torch.stack([size * turn.cos(), size * turn.sin(), 0 * size], -1).unsqueeze(1)
+
+
+def tension_of(robot: tr.Robot, B: int, random: torch.Generator) -> torch.Tensor | None:
+    count = len(robot.tendons)
+    return 160 * robot.rod.moment_scale / max(count, 1) * torch.rand(B, count, generator=random) if count else None
+
+
+def worded(problem: tr.Problem, contacts: int) -> tuple[list[str], torch.Tensor]:
+    """The messages of so many contacts, and which of them are of fits that are not accepted."""
+    a = analyze(problem, contact_hypotheses(problem, contacts))
+    return [a.message(b) for b in range(problem.batch)], ~a.estimate.accepted
+
+
+def bent(robot: tr.Robot, push: int, random: torch.Generator, B: int) -> tr.Problem:
+    """A stretch of 4 to 12 % of the length was bent before, by 0.05 to 0.3 rad, which no file knows."""
+    L, problems = robot.rod.length, []
+    for b in range(B):
+        at, wide = L * drawn(0.35, 0.6, 1, random), L * drawn(0.04, 0.12, 1, random)
+        bend, zero = drawn(0.05, 0.3, 1, random) * (-1) ** b / wide, torch.zeros(1)
+        rows = [(zero, zero), (at, zero), (at, bend), (at + wide, bend), (at + wide, zero), (zero + L, zero)]
+        table = torch.stack([torch.cat([s, u, zero, zero]) for s, u in rows])
+        own = tr.Robot(replace(robot.rod, reference_curvature=table), robot.tendons, robot.gravity)
+        load = tr.PointForces(push * lateral(robot, 1, random), L * drawn(0.8, 0.95, 1, random).unsqueeze(0))
+        problems.append(pushed(own, (load,), tension_of(robot, 1, random), random, 1)[0])
+    tension = None if problems[0].tension is None else torch.cat([q.tension for q in problems if q.tension is not None])
+    markers = tr.Markers(problems[0].s, torch.cat([q.reading[:, :60] for q in problems]).unflatten(1, (20, 3)), 1e-3 * L)
+    return tr.Problem(robot, problems[0].unknowns, [markers], tension)
+
+
+@pytest.mark.many_fits
+def test_a_bend_that_no_file_knows_is_not_more_contacts():
+    """Alone, or beside a push: where one contact more explains it by opposite ones side by side, on every robot."""
+    random, couples = torch.Generator().manual_seed(3), []
+    for robot in robots().values():
+        L = robot.rod.length
+        for contacts in (1, 2):
+            problem = bent(robot, contacts - 1, random, 6)
+            said, refused = worded(problem, contacts)
+            assert not [w for w in said if "not a contact near" in w and "try more --contacts" in w]
+            more = tr.estimate(problem.of(tr.Unknowns(tr.GaussianCoordinates(contacts + 1, L, robot.rod.force_scale))))
+            pair = torch.zeros(6, dtype=torch.bool)
+            for i, j in [(0, 1), (0, 2), (1, 2)][: 2 * contacts - 1]:
+                against = (more.force[:, i] * more.force[:, j]).sum(-1) < -0.9 * more.magnitude[:, i] * more.magnitude[:, j]
+                pair |= against & ((more.location[:, i] - more.location[:, j]).abs() < 0.12 * L)
+            couples += [said[b] for b in (pair & more.accepted & refused).nonzero().flatten().tolist()]
+    assert len(couples) >= 20
+    assert sum("not a contact near" in w for w in couples) >= 0.9 * len(couples)
+    assert sum("try more --contacts" in w for w in couples) <= 0.05 * len(couples)
+
+
+@pytest.mark.many_fits
+def test_two_opposite_pushes_that_the_markers_tell_apart_are_contacts():
+    """A quarter to half of the length apart, on every robot."""
+    random, told, B = torch.Generator().manual_seed(4), [], 12
+    for robot in robots().values():
+        L, force = robot.rod.length, lateral(robot, B, random)
+        first, gap = drawn(0.3, 0.45, B, random), drawn(0.25, 0.5, B, random)
+        both = torch.cat([force, -force * drawn(0.6, 1.4, B, random)[:, None, None]], 1)
+        loads = tr.PointForces(both, L * torch.stack([first, first + gap], -1))
+        said, refused = worded(pushed(robot, (loads,), tension_of(robot, B, random), random, B)[0], 1)
+        told += [said[b] for b in refused.nonzero().flatten().tolist()]
+    assert len(told) >= 40
+    assert sum("try more --contacts" in w for w in told) >= 0.85 * len(told)
+    assert sum("not a contact near" in w for w in told) <= 0.05 * len(told)

@@ -2,9 +2,9 @@
 
 import pytest
 from matplotlib.figure import Figure
-from studies.trust import coverage, drag, frame, markers, mistakes, unknown_noise
+from studies.trust import coverage, drag, frame, markers, mistakes, robots, scores, unknown_noise
 
-from torchrod import Estimate, estimate
+from torchrod import Estimate, estimate, solve_shape
 
 pytestmark = [pytest.mark.many_fits, pytest.mark.study]
 
@@ -72,3 +72,36 @@ def test_noise_and_count_unknown():
     assert abs(mean - 1) < 0.1
     assert 0.5 < least < most < 1.6
     assert far < 0.1
+
+
+def test_z_scores_of_another_solver(monkeypatch):
+    """Its shapes are those of many steps; z-scores of a cell of each table."""
+    monkeypatch.setattr(scores, "WITHIN", 9.0)  # without draws
+    for ratio in (1.0, 1e6):
+        problem, pushes, _ = scores.drawn(scores.Cell(1e-12, ratio, True), 8, scores.generator(1))
+        loads = problem.unknowns.loads.loads(pushes.gamma(problem.robot.rod.force_scale))
+        fine = solve_shape(problem.robot, loads, None, problem.s, 8, 640).p
+        assert float((fine - problem.reading[:, :60].unflatten(1, (20, 3))).abs().max()) < 1e-9
+    for cell in (scores.Cell(1e-5, 500.0, False), scores.Cell(1e-2, 1.0, False), scores.Cell(1e-6, 1e6, True)):
+        found = scores.measured(cell, 120, 2)
+        assert found.converged == 1
+        rms = found.z.square().mean(0).sqrt()
+        assert float((rms - 1).abs().max()) < 0.25
+
+
+def test_pushes_on_a_strip_no_wider_than_a_ribbon_are_all_fitted():
+    """A push across hardly shows; in units of both sides together one fit in ten ended in one of thousands of soft force scales."""
+    cell = scores.Cell(1e-3, 1e6, False)
+    problem, pushes, _ = scores.drawn(cell, 100, scores.generator(3))
+    fit = estimate(problem)
+    assert fit.accepted.all()
+    off, std = scores.errors(fit, pushes)
+    assert float((off / std)[:, [0, 2]].square().mean(0).sqrt().max()) < 1.5
+
+
+def test_robots_that_are_off():
+    """A row of each table."""
+    cells = robots.measured(("passive: stiffness 10 %", 0.001), 24, 5).split(" | ")
+    exact, stated = (int(cell.split("/")[0]) for cell in (cells[3], cells[5]))
+    assert exact < 60 < 85 < stated
+    assert robots.counted(("passive: set 0.1/m", 0.0025), 2, 5).startswith("| passive: set 0.1/m | 0.25 |")

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from ..estimation.result import Estimate
 from ..estimation.solve import Settings, estimate_each
+from ..mechanics.rod import Rod
 from ..model.load_families import GaussianCoordinates
 from ..model.marker_geometry import misplaced
 from ..model.problem import Problem
@@ -36,9 +37,11 @@ MOST_EXCHANGES = 3
 LOWERED = 0.5  # an exchange must halve what it is tried for, and chi^2, to be told
 TRANSLATION, ROTATION = 0.1, 0.35  # of the length, and rad: a base frame that is farther off than that is another mistake
 SURE = 10.0  # BIC: by so much a base frame must do better before it speaks against a fit that is accepted
-OPPOSITE = 0.3  # two forces are a couple where together they are no more than this part of the larger,
-APART = 0.25  # no farther apart than this part of the length,
-VAGUE = 0.8  # and each no better known than to this part of itself
+OPPOSITE = 0.9  # two forces are a couple where the cosine of their directions is below minus this,
+LEFT = 0.75  # together they are no more than this part of the larger: a real push beside the couple adds to one of them,
+APART = 0.25  # they are no farther apart than this part of the length,
+VAGUE = 0.8  # and each is no better known than to this part of itself,
+HUGE = 5.0  # or larger than so many force scales, where the prior begins to hold it
 ITERATIONS = 60
 ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
@@ -234,17 +237,17 @@ def _with_loads(unknowns: Unknowns, count: int) -> Unknowns | None:
     return replace(unknowns, loads=replace(loads, count=count))
 
 
-def couples(fit: Estimate, length: float) -> Float[Tensor, " B"]:
+def couples(fit: Estimate, rod: Rod) -> Float[Tensor, " B"]:
     """Where (m) two loads of a fit are opposite, close together and each hardly known, as unmodelled bending looks; else NaN."""
     found = fit.chi2.new_full((len(fit.status),), torch.nan)
     K = fit.location.shape[1]
     for i in range(K):
         for j in range(i + 1, K):
-            pair = fit.force[:, [i, j]]
-            larger = pair.norm(dim=-1).amax(-1)
-            opposite = pair.sum(1).norm(dim=-1) < OPPOSITE * larger
-            near = (fit.location[:, i] - fit.location[:, j]).abs() < APART * length
-            vague = (fit.magnitude_std[:, [i, j]] > VAGUE * fit.magnitude[:, [i, j]]).all(-1)
+            pair, size = fit.force[:, [i, j]], fit.magnitude[:, [i, j]]
+            opposite = (pair[:, 0] * pair[:, 1]).sum(-1) < -OPPOSITE * size.prod(-1)
+            opposite = opposite & (pair.sum(1).norm(dim=-1) < LEFT * size.amax(-1))
+            near = (fit.location[:, i] - fit.location[:, j]).abs() < APART * rod.length
+            vague = ((fit.magnitude_std[:, [i, j]] > VAGUE * size) | (size > HUGE * rod.force_scale)).all(-1)
             middle = 0.5 * (fit.location[:, i] + fit.location[:, j])
             found = torch.where(opposite & near & vague, middle, found)
     return found
@@ -280,7 +283,7 @@ def _explained(
     more = _with_loads(unknowns, count + 1)
     if more is not None and len(refused) and (part := problem.of(more).take(refused)).determined:
         fit = estimate_each(part, settings)
-        couple[refused] = torch.where(fit.accepted, couples(fit, problem.robot.rod.length), torch.nan)
+        couple[refused] = torch.where(fit.accepted, couples(fit, problem.robot.rod), torch.nan)
         by_load[refused] = _score(part, fit.accepted & couple[refused].isnan(), fit.chi2)
     best = torch.minimum(by_frame, torch.minimum(by_load, own - SURE))
     framed = torch.isfinite(best) & (by_frame == best)
@@ -318,7 +321,7 @@ def diagnose(
     geometry = [""] * B
     outliers: list[Cycle] = [()] * B
     markers, L = problem.markers, problem.robot.rod.length
-    couple = torch.where(fit.status == int(Status.CONVERGED), couples(fit, L), torch.nan)
+    couple = torch.where(fit.status == int(Status.CONVERGED), couples(fit, problem.robot.rod), torch.nan)
     tip_instead = torch.zeros(B, dtype=torch.bool)
 
     def misplaced_at(b: int) -> str:

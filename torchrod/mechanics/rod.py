@@ -135,8 +135,14 @@ class Rod(Float64):
 
     @property
     def force_scale(self) -> float:
-        """4 EI / L^2 (N): a force that bends the rod visibly; 1 N for the paper's rod, so that the paper's units carry over."""
-        return 4 * self.bending_stiffness / self.length**2
+        """4 EI / L^2 (N): a force that bends the rod visibly; 1 N for the paper's rod, so that the paper's units carry over.
+
+        Of a flat backbone no more than what lets it give way sideways, with sqrt(EI_soft GJ) for EI (4.01 at the tip of a strip,
+        Timoshenko & Gere 1961, 6.3), nor less than what bends its soft side.
+        """
+        (x, xy, _), (_, y, _), (_, _, torsion) = self.K_bt.detach().tolist()
+        soft = 0.5 * (x + y) - math.hypot(0.5 * (x - y), xy)
+        return 4 * min(self.bending_stiffness, max(soft, math.sqrt(soft * torsion))) / self.length**2
 
     @property
     def moment_scale(self) -> float:

@@ -91,7 +91,8 @@ class Problem(Float64):
     @cached_property
     def state(self) -> State:
         """The blocks of x, bound to this robot's scales."""
-        scales = key(self.unknowns), self.robot.rod.length, self.robot.rod.bending_stiffness, len(self.robot.tendons)
+        rod = self.robot.rod
+        scales = key(self.unknowns), rod.length, rod.bending_stiffness, rod.force_scale, len(self.robot.tendons)
         scales = (*scales, self.robot.weightless)
         return _states(scales, lambda: self.unknowns.state(self.robot))
 

@@ -1,15 +1,12 @@
-"""What intervals are worth on robots that are not quite as their file says: python scripts/uncertainty.py [--cases N] [--out docs].
+"""What intervals are worth on robots that are not quite as their file says.
 
 Every sample is the shape of a robot of its own, whose parameter is off by a draw of the stated standard deviation, under one push
-of 0.5 to 1 force scale; its load is estimated once with the robot taken as exact and once with the deviation stated. Writes
-uncertainty.md, row by row.
+of 0.5 to 1 force scale; its load is estimated once with the robot taken as exact and once with the deviation stated.
 """
 
-import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -34,21 +31,25 @@ from torchrod import (
 )
 from torchrod.mechanics.lie import move
 
-LENGTH, MARKERS, SEED = 0.4, 20, 11
+from .cases import generator, in_parallel
+
+LENGTH, MARKERS = 0.4, 20
+NOISES = 0.001, 0.0025  # of the length
 Reading = Tensor | None
 Change = Callable[[Robot, Reading, torch.Generator], tuple[Robot, Reading]]
-HEAD = """# Robots that are not quite as their file says
-
-Made by `python scripts/uncertainty.py`. One push of 0.5 to 1 force scale between 30 and 95 % of the length, 20 markers. Every
-sample is the shape of a robot of its own, off by a draw of the deviation in the first column; the forward solve is the library's.
-Shares of the 95 % intervals of force / place that hold the truth, of converged samples, first with the robot taken as exact, then
-with the deviation stated under `[uncertainty]`. With {cases} cases a share of 95 % is known to about {error:.1f} %.
+ABOUT = """\
+One push of 0.5 to 1 force scale between 30 and 95 % of the length, 20 markers. Every sample is the shape of a robot of its own, off
+by a draw of the deviation in the first column; the forward solve is the library's. Shares of the 95 % intervals of force / place
+that hold the truth, of converged samples, first with the robot taken as exact, then with the deviation stated under
+`[uncertainty]`. With {cases} cases a share of 95 % is known to about {error:.1f} %.
 
 | what is off | noise (% of L) | exact: accepted | force / place (%) | stated: accepted | force / place (%) | error of place (mm) |
-|---|---|---|---|---|---|---|
-"""
+|---|---|---|---|---|---|---|"""
+REPEATED = """
+With 200 cases a share below 93 % is chance as a rule. Of the rows with 91 or 92 %, with 1000 cases of other draws: three tendons,
+stiffness 10 %, 0.1 %: force 94.2, place 95.0 (z-scores of RMS 1.02 and 1.02); passive, frame, 0.1 %: 93.7, 94.0 (1.05 and 1.05)."""
 CONTACTS = """
-## Whether anything pushes
+### Whether anything pushes
 
 The same with `--contacts auto`, {cases} cases a row, first without a push, then with one of 0.5 to 1 force scale. Found: shapes
 with an accepted contact whose 95 % interval of the force excludes zero. Of pushed shapes: found / counted as one / of those, the
@@ -154,9 +155,9 @@ def rows() -> list[Row]:
     return found
 
 
-def shapes_of(row: Row, noise: float, cases: int, pushed: bool) -> tuple[Markers, Reading, Tensor, Tensor]:
+def shapes_of(row: Row, noise: float, cases: int, pushed: bool, seed: int) -> tuple[Markers, Reading, Tensor, Tensor]:
     """Markers and tensions of as many shapes, each of a robot of its own, and the size (N) and place (m) of its push."""
-    g, robot = torch.Generator().manual_seed(SEED), row.robot
+    g, robot = generator(seed), row.robot
     size = robot.rod.force_scale * (0.5 + 0.5 * torch.rand(cases, 1, generator=g, dtype=torch.float64))
     turn = 2 * math.pi * torch.rand(cases, 1, generator=g, dtype=torch.float64)
     place = LENGTH * (0.3 + 0.65 * torch.rand(cases, 1, generator=g, dtype=torch.float64))
@@ -182,11 +183,12 @@ def _problem(row: Row, markers: Markers, tension: Reading, stated: bool) -> Prob
     return Problem(row.robot, Unknowns(loads, registration=own[0], uncertainty=own[1]), [markers], tension)
 
 
-def counted(row: Row, noise: float, cases: int) -> str:
-    """The row of the second table: whether there is a contact, where nothing pushes and where something does."""
-    cells = []
+def counted(which: tuple[str, float], cases: int, seed: int) -> str:
+    """The row of the second table, by its name and noise: is there a contact, where nothing pushes and where something does?"""
+    (name, noise), cells = which, []
+    row = next(row for row in contact_rows() if row.name == name)
     for pushed in (False, True):
-        markers, tension, _, place = shapes_of(row, noise, cases, pushed)
+        markers, tension, _, place = shapes_of(row, noise, cases, pushed, seed)
         for stated in (False, True):
             problem = _problem(row, markers, tension, stated)
             found = analyze(problem, contact_hypotheses(problem)).estimate
@@ -203,9 +205,11 @@ def counted(row: Row, noise: float, cases: int) -> str:
     return f"| {row.name} | {100 * noise:g} | {bare} | {told} | {exact} | {stated} |"
 
 
-def measured(row: Row, noise: float, cases: int) -> str:
-    """The row of the first table."""
-    markers, tension, size, place = shapes_of(row, noise, cases, True)
+def measured(which: tuple[str, float], cases: int, seed: int) -> str:
+    """The row of the first table, by its name and noise."""
+    name, noise = which
+    row = next(row for row in rows() if row.name == name)
+    markers, tension, size, place = shapes_of(row, noise, cases, True, seed)
 
     def fitted(stated: bool) -> tuple[str, str, float]:
         fit = estimate(_problem(row, markers, tension, stated))
@@ -246,30 +250,13 @@ def contact_rows() -> list[Row]:
     return found
 
 
-def main() -> None:
-    """All rows, told and written as they come."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=200)
-    parser.add_argument("--out", type=Path, default=Path("docs"))
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    path = options.out / "uncertainty.md"
-    path.write_text(HEAD.format(cases=options.cases, error=100 * math.sqrt(0.95 * 0.05 / options.cases)))
-    for row in rows():
-        for noise in (0.001, 0.0025):
-            _tell(path, measured(row, noise, options.cases))
-    few = max(1, options.cases // 4)
-    _tell(path, CONTACTS.format(cases=few))
-    for row in contact_rows():
-        for noise in (0.001, 0.0025):
-            _tell(path, counted(row, noise, few))
-
-
-def _tell(path: Path, line: str) -> None:
-    print(line, flush=True)
-    with path.open("a") as file:
-        file.write(line + "\n")
-
-
-if __name__ == "__main__":
-    main()
+def run(cases: int) -> list[str]:
+    """Both tables; whether anything pushes by a quarter of the samples."""
+    few = max(1, cases // 4)
+    lines = ["## Robots that are not quite as their file says", ""]
+    lines.append(ABOUT.format(cases=cases, error=100 * math.sqrt(0.95 * 0.05 / cases)))
+    every = [(row.name, noise) for row in rows() for noise in NOISES]
+    lines += in_parallel(measured, every, cases, 1000, "robots")
+    lines += [REPEATED, CONTACTS.format(cases=few)]
+    every = [(row.name, noise) for row in contact_rows() for noise in NOISES]
+    return lines + in_parallel(counted, every, few, 1100, "pushes")
