@@ -141,11 +141,12 @@ def test_the_command_line_tells(tmp_path, capsys):
         assert "try --registration" in moved["message"]
         assert moved["suspect_markers"] == unhurt["suspect_markers"] == []
         assert unhurt["message"] == "Converged."
-        options[-1] = str(tmp_path / "result.npz")
-        assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), *options]) == 0
-        capsys.readouterr()
-        with np.load(tmp_path / "result.npz", allow_pickle=False) as arrays:
-            assert arrays["messages"][arrays["message"]].tolist() == [record["message"] for record in (swapped, moved, unhurt)]
+        if count == "1":
+            options[-1] = str(tmp_path / "result.npz")
+            assert main(["estimate", str(tmp_path / "robot.toml"), str(tmp_path / "shapes.csv"), *options]) == 0
+            capsys.readouterr()
+            with np.load(tmp_path / "result.npz", allow_pickle=False) as arrays:
+                assert arrays["messages"][arrays["message"]].tolist() == [record["message"] for record in (swapped, moved, unhurt)]
 
 
 @pytest.mark.parametrize("count", [1, 2])

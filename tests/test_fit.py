@@ -68,7 +68,7 @@ def close(a: torch.Tensor, b: torch.Tensor, relative: float = 1e-10) -> bool:
     return bool((a - b).abs().max() <= relative * b.abs().max())
 
 
-def case(robot: Robot, family, noise: float = 1e-3, steps: int = 4, **unknown: Any) -> tuple[Problem, torch.Tensor]:
+def case(robot: Robot, family, noise: float = 1e-3, steps: int = 2, **unknown: Any) -> tuple[Problem, torch.Tensor]:
     """A problem and a state somewhere, with markers on stalks one of which is missing."""
     generator = torch.Generator().manual_seed(1)
     positions = 0.1 * torch.randn(B, 3, 3, generator=generator)
@@ -344,7 +344,7 @@ def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     points = kind == "points"
     family = PointCoordinates(n, 0.4, 1.0) if points else GaussianCoordinates(n, 0.4, 1.0)
     registration = Registration() if kind == "registration" else None
-    problem = posed(s, p, 1e-3, robot, family, tension, steps=8, registration=registration)
+    problem = posed(s, p, 1e-3, robot, family, tension, steps=4, registration=registration)
     compiled = fits(problem)
     monkeypatch.setattr(kernel, "available", lambda: False)
     plain = fits(problem)

@@ -367,7 +367,7 @@ def test_a_load_too_few_is_told_without_markers():
     other = study.Push(push.force.flip(0), T([0.12, 0.3]), push.tip)
     u = push.at(study.GRATINGS).u + other.at(study.GRATINGS).u
     problem = Problem(study.ROBOT, study.unknowns(False), [Curvature(study.GRATINGS, u[..., :2], 0.01)])
-    found = analyze(problem, settings=Settings(restarts=()))
+    found = analyze(problem, settings=Settings(restarts=(), basins=0))
     assert not found.estimate.accepted.any()
     assert "does not explain the readings" in found.message(0)
     assert "One more contact" in found.message(0)
