@@ -97,7 +97,7 @@ def test_no_output_replaces_an_input(folder, capsys):
 
 # A command for each screen, in a process of its own; what they import is imported once, by the command before them.
 SCREENS = """
-import io, json, os, sys
+import gc, io, json, os, sys
 from torchrod.cli import main
 command = ["estimate", "rod.toml", "s.csv", "--steps", "10", "--out"]
 
@@ -117,6 +117,7 @@ status, screen = {}, sys.stdout
 sys.stdout = io.StringIO()
 assert main([*command, "before.json"]) == 0
 sys.stdout = screen
+gc.freeze()
 for screen in ("closed pipe", "full", "ascii", "none"):
     child = os.fork()
     if child == 0:
