@@ -266,7 +266,7 @@ def test_a_strong_push_near_the_tip_is_found_by_a_restart():
     fit = estimate(problem, Settings(basins=0))
     assert fit.accepted.all()
     assert estimate(problem, Settings(restarts=())).accepted[:3].all(), "a start elsewhere finds these as well"
-    assert fit.restarts.tolist() == [1, 1, 0, 2, 2, 2]
+    assert fit.restarts.tolist() == [1, 1, 0, 3, 3, 3]
     assert (fit.iterations >= once.iterations).all()
     assert torch.allclose(fit.magnitude, force.norm(dim=-1), rtol=0.02)
 
