@@ -17,7 +17,7 @@ import torch
 
 from tests.problems import posed
 from tests.study import study1
-from torchrod import estimate, write_result
+from torchrod import Result, estimate, write_result
 from torchrod.analysis.diagnosis import diagnose
 from torchrod.cli import main, table
 from torchrod.cli.parser import COMMANDS
@@ -217,7 +217,7 @@ def test_a_result_needs_a_name_for_every_sample(fitted, tmp_path):
     for suffix in (".json", ".npz"):
         for names in (["a"], ["a"] * 121):
             with pytest.raises(InputError, match=f"{len(names)} names for 120 samples"):
-                write_result(tmp_path / f"r{suffix}", fitted[1], names, "rod")
+                write_result(tmp_path / f"r{suffix}", Result(fitted[1], names, "rod"))
     assert not list(tmp_path.iterdir())
 
 
@@ -231,8 +231,8 @@ def test_table_and_records_are_linear_in_the_samples(fitted, tmp_path, monkeypat
     counts = []
     for write in (
         lambda: table.table(fitted[1], ["a"] * 120, fitted[2], None),
-        lambda: write_result(tmp_path / "r.json", fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2]),
-        lambda: write_result(tmp_path / "r.npz", fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2]),
+        lambda: write_result(tmp_path / "r.json", Result(fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2])),
+        lambda: write_result(tmp_path / "r.npz", Result(fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2])),
     ):
         asked.clear()
         write()
