@@ -61,7 +61,7 @@ def test_values_and_jacobians(kind, loads, registration):
         "smooth": SmoothCoordinates(0.4, scale, 2.0, 0.2, terms=5),
     }[loads]
     s, tension, offsets = T([0.1, 0.25, 0.4]), TENSION if len(robot.tendons) else None, 0.01 * torch.eye(3)
-    problem = posed(s, torch.zeros(3, 3, 3), 1e-3, robot, family, tension, offsets, steps=5, registration=registration)
+    problem = posed(s, torch.zeros(3, 3, 3), 1e-3, robot, family, tension, offsets, steps=2, registration=registration)
     start = problem.state.join(family.start().expand(3, -1), torch.zeros(3, 6))
     x = start + 0.3 * torch.randn(3, problem.size, generator=torch.Generator().manual_seed(1))
     h, H = problem.linearized(x)
