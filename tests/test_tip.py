@@ -86,7 +86,7 @@ def test_the_jacobian_is_that_of_h(tip):
     """The compiled path against forward mode through the definition, on a tendon robot with contact, registration and tip."""
     robot, markers, tension, _ = six_tendons()
     few, loads = torch.arange(2), GaussianCoordinates(1, 0.4, robot.rod.force_scale)
-    problem = Problem(robot, Unknowns(loads, tip, registration=Registration()), [markers], tension, steps=10).take(few)
+    problem = Problem(robot, Unknowns(loads, tip, registration=Registration()), [markers], tension, steps=4).take(few)
     x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     h, H = problem.linearized(x)
     value, slope = forward_jacobian(problem.h, x)
