@@ -74,9 +74,9 @@ def test_values_and_jacobians(kind, loads, registration):
 def test_the_forward_solve(monkeypatch):
     """Tip to base with every kind of known load, per-sample nodes included, with and without the kernel."""
     robot, s = busy_robot(), T([0.1, 0.25, 0.4])
-    local = PointWrenches(T([[[0.2, 0.1, 0.3]]]), T([[[0.01, 0.02, 0.005]]]), T([0.17]), frame="local")
-    dead = PointWrenches(T([[[0.1, 0.2, -0.1]]]), T([[[0.01, -0.02, 0.01]]]), T([0.33]))
-    points = PointForces(T([[[0.3, 0.1, 0.0]], [[0.2, 0.4, 0.0]], [[0.0, 0.1, 0.0]]]), T([[0.11], [0.29], [0.4]]))
+    local = PointWrenches(T([[[0.06, 0.03, 0.09]]]), T([[[0.003, 0.006, 0.002]]]), T([0.17]), frame="local")
+    dead = PointWrenches(T([[[0.03, 0.06, -0.03]]]), T([[[0.003, -0.006, 0.003]]]), T([0.33]))
+    points = PointForces(T([[[0.1, 0.03, 0.0]], [[0.06, 0.12, 0.0]], [[0.0, 0.03, 0.0]]]), T([[0.11], [0.29], [0.4]]))
 
     def solve():
         return solve_shape(robot, (local, dead, points), TENSION, s, 3, 2)

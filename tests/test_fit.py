@@ -104,11 +104,12 @@ FRAMES = {
 
 
 def combined() -> list[Any]:
-    """Every robot with every family and frame; a plain run has every family in the fullest frame, and every frame for one."""
+    """Every robot with every family and frame; a plain run has two robots with every family, and every robot with every frame."""
     every = [(r, f, k) for r in ROBOTS for f in FAMILIES for k in FRAMES]
-    quick = {"zeta, tip wrench, tensions": FAMILIES, "plain": ("one gaussian", "points"), "tensions": ("one gaussian",)}
-    quick["zeta, tip force"] = ("one gaussian",)
-    return [pytest.param(r, f, k, marks=() if f in quick[k] else pytest.mark.study, id=f"{r}-{f}-{k}") for r, f, k in every]
+    fullest, quick = "zeta, tip wrench, tensions", [(r, "one gaussian", k) for r in ROBOTS for k in FRAMES]
+    quick += [(r, f, fullest) for r in ("passive", "helical tendons and gravity") for f in FAMILIES]
+    quick += [(r, "points", k) for r in ROBOTS for k in ("plain", fullest)]
+    return [pytest.param(r, f, k, marks=() if (r, f, k) in quick else pytest.mark.study, id=f"{r}-{f}-{k}") for r, f, k in every]
 
 
 @pytest.mark.parametrize(("robot", "family", "frame"), combined())
@@ -326,7 +327,7 @@ def fits(problem: Problem, settings: Settings | None = None):
 
 @pytest.mark.parametrize(
     "kind",
-    ["two contacts", "registration", *(pytest.param(k, marks=pytest.mark.study) for k in ("one contact", "tendons", "points"))],
+    ["two contacts", *(pytest.param(k, marks=pytest.mark.study) for k in ("registration", "one contact", "tendons", "points"))],
 )
 def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     """Loads to 1e-8 relative, status and iterations the same."""
