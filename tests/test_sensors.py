@@ -34,7 +34,7 @@ from torchrod import (
 from torchrod.model.sensors import RodState
 
 P, L = 6, 0.4
-HASTY = Settings(max_iterations=20, restarts=())
+HASTY = Settings(max_iterations=20, restarts=(), basins=0)
 S = torch.linspace(0.05, 0.4, P, dtype=torch.float64)
 ALONG = torch.linspace(0, L, 13, dtype=torch.float64)
 TURN = torch.linalg.matrix_exp(T([[0.0, -0.3, 0.2], [0.3, 0.0, -0.5], [-0.2, 0.5, 0.0]], dtype=torch.float64))
