@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,17 @@ PICTURE = (ROOT / "docs" / "architecture.md").read_text().split("```")[1].strip(
 ORDER = [line.split()[0] for line in PICTURE]  # from the command line down: a package imports only what stands below it
 
 
+@lru_cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@lru_cache
 def imports_of(path: Path) -> set[str]:
     """The modules of torchrod that a file imports, as dotted names below torchrod; those it names for type checking included."""
     here = path.relative_to(LIBRARY).parent.parts
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.ImportFrom) and node.level:
             base = here[: len(here) - node.level + 1]
             module = [*base, *(node.module.split(".") if node.module else [])]
@@ -35,7 +42,7 @@ def test_the_picture_names_every_package():
     packages = {path.parent.name for path in LIBRARY.glob("*/__init__.py")}
     assert set(ORDER) == packages
     for name in packages:
-        assert ast.get_docstring(ast.parse((LIBRARY / name / "__init__.py").read_text())), f"{name} does not say what it is for"
+        assert ast.get_docstring(parsed(LIBRARY / name / "__init__.py")), f"{name} does not say what it is for"
 
 
 @pytest.mark.parametrize("package", ORDER)
@@ -104,7 +111,7 @@ def test_nothing_is_said_twice():
     """No function with the same name and body, and no tuple of the same name and values, in two modules."""
     seen = {}
     for path in MODULES:
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             if isinstance(node, ast.FunctionDef):
                 what = node.name, ast.dump(node.args), *map(ast.dump, node.body[ast.get_docstring(node) is not None :])
             elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Tuple):

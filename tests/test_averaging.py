@@ -52,7 +52,7 @@ def test_probabilities_are_those_of_the_evidence():
 
 def test_a_resultant_holds_what_was_merged():
     """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of the resultants of these."""
-    problem, truth = posed(40, 2, (0.5, 2.0), gap=0.06 * L)
+    problem, truth = posed(24, 2, (0.5, 2.0), gap=0.06 * L)
     found = analyze(problem, contact_hypotheses(problem), sampled=True)
     assert found.intervals is not None and found.evidence is not None and found.evidence.probability is not None
     interval = found.intervals.resultant[:, 3]
@@ -65,7 +65,7 @@ def test_a_resultant_holds_what_was_merged():
 
 def test_close_explanations_are_told(tmp_path, capsys):
     """In the message, and with probabilities in RESULT.json; bands and resultants are there."""
-    problem, _ = posed(8, 3, (0.3, 0.6), gap=0.03)
+    problem, _ = posed(4, 3, (0.3, 0.6), gap=0.03)
     rows = ["sample,s,x,y,z"]
     markers = problem.markers
     assert markers is not None
@@ -92,8 +92,8 @@ def test_close_explanations_are_told(tmp_path, capsys):
 
 
 def test_a_band_of_any_form_holds_a_uniform_load():
-    """Over 30 or 60 % of the rod, of 400 point forces; a Gaussian's band holds a quarter of it."""
-    random, robot, B, M = torch.Generator().manual_seed(4), steel_rod(), 16, 400
+    """Over 30 or 60 % of the rod, of 100 point forces; a Gaussian's band holds a quarter of it."""
+    random, robot, B, M = torch.Generator().manual_seed(4), steel_rod(), 8, 100
     s = (torch.arange(M, dtype=DTYPE) + 0.5) / M
     first, length = 0.1 + 0.3 * torch.rand(B, 1, generator=random, dtype=DTYPE), T([0.3, 0.6]).repeat(B // 2).unsqueeze(-1)
     f = ((s > first) & (s < first + length)).to(DTYPE) / length  # of 1 N, per length

@@ -173,7 +173,7 @@ def test_threads_that_ask_at_once_begin_one_build_under_a_name_of_its_own(tmp_pa
 @needs_compiler
 def test_processes_that_begin_at_once_build_once(tmp_path):
     """And both wait for it, with one line each."""
-    cxx = copying(tmp_path, f"echo once >> {tmp_path}/builds", "sleep 2")
+    cxx = copying(tmp_path, f"echo once >> {tmp_path}/builds", "sleep 1")
     both = [begin(LOADED, cxx, tmp_path / "cache") for _ in range(2)]
     assert [ended(process)[1] for process in both] == [build.LINE + "\n"] * 2
     assert (tmp_path / "builds").read_text() == "once\n"

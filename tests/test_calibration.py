@@ -205,7 +205,7 @@ def test_a_parameter_that_does_not_show_is_named():
 @pytest.mark.many_fits
 def test_too_few_iterations_are_reported():
     make, mass, tension = ROBOTS["one tendon"]
-    found = run(make(20 * mass), shapes_of(make(), tension), settings=Settings(max_iterations=2))
+    found = run(make(3 * mass), shapes_of(make(), tension), settings=Settings(max_iterations=2))
     assert found.status is Status.NOT_CONVERGED
     assert not found.accepted
     assert bool(found.std.isnan().all())
@@ -232,8 +232,10 @@ def test_an_offset_shifts_the_readings(fast, monkeypatch):
         for r, t in ((offset, readings), (plain, readings + d))
     ]
     assert all(float((u - v).abs().max()) < 1e-12 * float(u.abs().max()) for u, v in zip(*seen, strict=True))
-    slack = solve_shape(two_tendons(offsets=(-5.0, -5.0)), (), readings, s, 2, 2).p
-    assert torch.equal(slack, solve_shape(plain, (), 0 * readings, s, 2, 2).p)
+    slack, none = ((two_tendons(offsets=(-5.0, -5.0)), readings), (plain, 0 * readings))
+    assert torch.equal(*(shape_from_base(r, (), alpha, t, s, 2).p for r, t in (slack, none)))
+    if fast == "1":
+        assert torch.equal(*(solve_shape(r, (), t, s, 2, 2).p for r, t in (slack, none)))
 
 
 TOML = """# our robot
@@ -585,9 +587,8 @@ def test_results_of_a_calibrated_robot_in_space_and_in_a_figure(tmp_path, capsys
     at = torch.isin(T([*s.tolist(), 0.3]).sort().values, s)
     write_shapes(shapes, Shapes(s, (solved[at] + T([0.02, 0.0, 0.0]))[None], ["a"], None, T([[2.0]])))
     for suffix in ("json", "npz"):
-        result, figure = tmp_path / f"r.{suffix}", tmp_path / f"{suffix}.png"
+        result = tmp_path / f"r.{suffix}"
         assert main(["estimate", str(robot), str(shapes), "--load-prior", "point", "--out", str(result)]) == 0
-        assert main(["plot", str(robot), str(shapes), str(result), "--out", str(figure)]) == 0
         fit = read_fit(result, "a")
         nearly = read_uncertainty(robot).of_a_sample
         assert nearly is not None
@@ -599,6 +600,7 @@ def test_results_of_a_calibrated_robot_in_space_and_in_a_figure(tmp_path, capsys
         assert (
             float((shape_from_base(plain, fit.loads(0.4), fit.base_wrench[None], T([[2.0]]), s, 40).p[0] - line).abs().max()) > 5e-3
         )
+    assert main(["plot", str(robot), str(shapes), str(tmp_path / "r.json"), "--out", str(tmp_path / "r.png")]) == 0
     load = json.loads((tmp_path / "r.json").read_text())["results"][0]["loads"][0]
     assert load["position_lab_m"] == pytest.approx([a + b for a, b in zip(load["position_m"], (1.02, 0, 0), strict=True)], abs=1e-6)
     capsys.readouterr()

@@ -14,7 +14,7 @@ from tests.test_fast import needs_compiler
 from torchrod import GaussianCoordinates, kernel
 from torchrod.estimation.evaluator import KernelEvaluator
 
-BEGIN = """
+CODE = """
 import os, threading
 import torch
 from torchrod import kernel
@@ -24,6 +24,30 @@ from tests import test_crew
 assert kernel.available()
 call, tasks = test_crew.caller(400), lambda: len(os.listdir("/proc/self/task"))
 torch.set_num_threads(3)
+whole, before = call(), tasks()
+for _ in range(20):
+    call()
+assert tasks() == before, (before, tasks())
+torch.set_num_threads(5)
+call()
+assert tasks() == before + 2, (before, tasks())
+
+torch.set_num_threads(3)
+stop, failed = threading.Event(), 0
+def busy():
+    while not stop.is_set():
+        call()
+other = threading.Thread(target=busy)
+other.start()
+for _ in range(10):  # the other thread is in the kernel at nearly any time
+    child = os.fork()
+    if child == 0:
+        before, found, after = tasks(), call(), tasks()
+        os._exit((before, after, test_crew.same(found, whole)) != (1, 3, True))
+    failed += os.waitpid(child, 0)[1] != 0
+stop.set()
+other.join()
+assert failed == 0
 """
 
 
@@ -39,50 +63,16 @@ def same(a: kernel.Sums, b: kernel.Sums) -> bool:
     return all(torch.equal(getattr(a, name), getattr(b, name)) for name in vars(a))
 
 
-def run(code: str) -> None:
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", BEGIN + code], capture_output=True, text=True, check=False, cwd=root, timeout=120)
-    assert done.returncode == 0, done.stderr
-
-
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /proc here, which counts a process's threads")
 
 
 @needs_compiler
 @linux
-def test_threads_are_begun_once():
-    run("""
-call()
-before = tasks()
-for _ in range(20):
-    call()
-assert tasks() == before, (before, tasks())
-torch.set_num_threads(5)
-call()
-assert tasks() == before + 2, (before, tasks())
-""")
-
-
-@needs_compiler
-@linux
-def test_a_fork_has_threads_of_its_own_whatever_its_parents_were_doing():
-    run("""
-whole, stop, failed = call(), threading.Event(), 0
-def busy():
-    while not stop.is_set():
-        call()
-other = threading.Thread(target=busy)
-other.start()
-for _ in range(20):  # the other thread is in the kernel at nearly any time
-    child = os.fork()
-    if child == 0:
-        before, found, after = tasks(), call(), tasks()
-        os._exit((before, after, test_crew.same(found, whole)) != (1, 3, True))
-    failed += os.waitpid(child, 0)[1] != 0
-stop.set()
-other.join()
-assert failed == 0
-""")
+def test_threads_are_begun_once_and_anew_in_a_fork():
+    """In a process of its own, which has begun no others. A fork has its own whatever its parent's threads were doing."""
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=False, cwd=root, timeout=120)
+    assert done.returncode == 0, done.stderr
 
 
 @needs_compiler
@@ -93,7 +83,7 @@ def test_callers_at_once_get_the_answers_of_each_alone():
 
     def ask(k: int) -> None:
         start.wait()
-        found[k].extend(calls[k]() for _ in range(200))
+        found[k].extend(calls[k]() for _ in range(100))
 
     before = torch.get_num_threads()
     torch.set_num_threads(3)
@@ -106,5 +96,5 @@ def test_callers_at_once_get_the_answers_of_each_alone():
     finally:
         torch.set_num_threads(before)
     for one, several in zip(alone, found, strict=True):
-        assert len(several) == 200
+        assert len(several) == 100
         assert all(same(one, other) for other in several)

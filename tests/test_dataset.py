@@ -113,6 +113,15 @@ def test_only_damaged_and_missing_shards_are_made_again(tmp_path, made, capsys):
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == whole
 
 
+def test_a_cluster_makes_the_same_files(made):
+    """Here its workers are threads of this process."""
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install torchrod[scale]")
+    local = {"processes": False, "protocol": "tcp", "dashboard_address": None}
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **local) as cluster:
+        assert made("there", "--scheduler", cluster.scheduler_address) == made("here")
+
+
+@pytest.mark.study
 def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, made):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install torchrod[scale]")
     (tmp_path / "d.toml").write_text(SPEC.replace("samples = 250", "samples = 6000").replace("70", "500"))

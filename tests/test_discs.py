@@ -108,7 +108,7 @@ def test_kernel_and_derivatives():
     g = torch.Generator().manual_seed(2)
     markers = Markers(torch.tensor([0.1, 0.2, 0.27]), 0.1 * torch.randn(3, 3, 3, generator=g), 1e-3, 0.01 * torch.eye(3))
     tension = torch.tensor([[2.0, 1.0, 0.5], [4.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale), tension_std=0.3), [markers], tension, 4)
+    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale), tension_std=0.3), [markers], tension, 2)
     x = 0.3 * torch.randn(3, problem.size, generator=g)
     assert isinstance(evaluator(problem), KernelEvaluator)
     _, H = forward_jacobian(problem.h, x)

@@ -104,10 +104,12 @@ def test_known_loads_of_single_precision(kind):
         robot = Robot(rod, Tendons((Tendon.straight(0.01, 0.0, 0.4),)), gravity.to(to))
         assert equal(rod, doubled(rod)) and equal(robot, doubled(robot))
         solved = solve_shape(robot, (load,), tension.to(to), s.to(to), 1)
-        pulled = solve_displacement(robot, (load,), f([1e-3]).to(to), s.to(to)).equilibrium
         again = shape_from_base(robot, (load,), solved.base_wrench.float().to(to), tension.to(to), s.to(to), 40)
-        assert solved.status == pulled.status == 0
-        found.append((solved, pulled, again))
+        found.append([solved, again])
+        if kind == "point":  # that the tendon is pulled by a length has nothing to do with the load
+            found[-1].append(solve_displacement(robot, (load,), f([1e-3]).to(to), s.to(to)).equilibrium)
+            assert found[-1][-1].status == 0
+        assert solved.status == 0
     assert all(equal(single, double) for single, double in zip(*found, strict=True))
 
 

@@ -22,7 +22,7 @@ def test_h_has_exact_derivatives():
     s, tension, offsets = T([0.1, 0.23, 0.4]), T([[3.0, 2.0], [1.0, 4.0]]), 0.01 * torch.eye(3)
     torch.manual_seed(0)
     for loads in (GaussianCoordinates(1, 0.4, robot.rod.force_scale), PointCoordinates(1, 0.4, robot.rod.force_scale)):
-        problem = posed(s, torch.zeros(2, 3, 3), 1e-3, robot, loads, tension, offsets, 10, registration=Registration())
+        problem = posed(s, torch.zeros(2, 3, 3), 1e-3, robot, loads, tension, offsets, 4, registration=Registration())
         start = problem.state.join(loads.start().expand(2, -1), torch.zeros(2, 6))
         check(problem, start + 0.3 * torch.randn(2, problem.size))
 
@@ -31,7 +31,7 @@ def test_derivatives_are_exact_at_zero_load_zero_strain_and_zero_rotation():
     robot = busy_robot()
     loads = GaussianCoordinates(2, 0.4, robot.rod.force_scale)
     s, tension, offsets = T([0.1, 0.4]), T([[0.0, 0.0]]), torch.zeros(2, 3)
-    problem = posed(s, torch.zeros(1, 2, 3), 1e-3, robot, loads, tension, offsets, 10, registration=Registration())
+    problem = posed(s, torch.zeros(1, 2, 3), 1e-3, robot, loads, tension, offsets, 4, registration=Registration())
     check(problem, problem.state.join(loads.start().unsqueeze(0), torch.zeros(1, 6)))
 
 

@@ -17,7 +17,7 @@ import torch
 
 from tests.problems import posed
 from tests.study import study1
-from torchrod import estimate, write_result
+from torchrod import Result, estimate, write_result
 from torchrod.analysis.diagnosis import diagnose
 from torchrod.cli import main, table
 from torchrod.cli.parser import COMMANDS
@@ -95,41 +95,61 @@ def test_no_output_replaces_an_input(folder, capsys):
         assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize("screen", ["closed pipe", "full", "ascii", "none"])
-def test_no_screen_loses_a_result(folder, screen):
+# A command for each screen, in a process of its own; what they import is imported once, by the command before them.
+SCREENS = """
+import gc, io, json, os, sys
+from torchrod.cli import main
+command = ["estimate", "rod.toml", "s.csv", "--steps", "10", "--out"]
+
+def see(screen):
+    os.dup2(os.open(f"{screen}.err", os.O_WRONLY | os.O_CREAT), 2)
+    reader, writer = os.pipe()
+    os.close(reader)
+    full, ascii = os.open("/dev/full", os.O_WRONLY), os.open("ascii.out", os.O_WRONLY | os.O_CREAT)
+    files = {"closed pipe": writer, "full": full, "ascii": ascii}
+    sys.stdout = None  # as Python has it where there is no file 1
+    os.close(1)
+    if screen in files:
+        os.dup2(files[screen], 1)
+        sys.stdout = io.TextIOWrapper(open(1, "wb", closefd=False), "ascii" if screen == "ascii" else "utf-8")
+
+status, screen = {}, sys.stdout
+sys.stdout = io.StringIO()
+assert main([*command, "before.json"]) == 0
+sys.stdout = screen
+gc.freeze()
+for screen in ("closed pipe", "full", "ascii", "none"):
+    child = os.fork()
+    if child == 0:
+        see(screen)
+        sys.exit(main([*command, f"{screen}.json"]))
+    status[screen] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+json.dump(status, sys.stdout)
+"""
+
+
+def test_no_screen_loses_a_result(folder):
     """The files are written before the first word."""
     name = "Prüfling-β"
     text = (folder / "rod.csv").read_text().splitlines()
     (folder / "s.csv").write_text("\n".join([text[0], *(f"{name}," + row.split(",", 1)[1] for row in text[1:21])]))
-    command = [*COMMAND, "estimate", "rod.toml", "s.csv", "--steps", "10", "--out", "r.json"]
-    environment = os.environ | {"PYTHONIOENCODING": "ascii"} if screen == "ascii" else dict(os.environ)
-    if screen == "closed pipe":
-        reader, writer = os.pipe()
-        os.close(reader)
-        done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
-        os.close(writer)
-        assert (done.returncode, done.stderr) == (0, "")
-    elif screen == "full":
-        with Path("/dev/full").open("w") as device:
-            done = subprocess.run(command, stdout=device, stderr=subprocess.PIPE, text=True, check=False)
-        assert done.returncode == 2
-        assert (
-            done.stderr == "torchrod: standard output: cannot be written (No space left on device); free some space on its disk\n"
-        )
-    elif screen == "none":
-        done = subprocess.run(["sh", "-c", 'exec "$@" >&-', "sh", *command], stderr=subprocess.PIPE, text=True, check=False)
-        assert (done.returncode, done.stderr) == (0, "")
-    else:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-        assert (done.returncode, done.stderr) == (0, "")
-        assert "Pr\\xfcfling-\\u03b2" in done.stdout
-    (record,) = json.loads((folder / "r.json").read_text())["results"]
-    assert record["sample"] == name
+    done = subprocess.run([sys.executable, "-c", SCREENS], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"closed pipe": 0, "full": 2, "ascii": 0, "none": 0}
+    for screen in json.loads(done.stdout):
+        said = (folder / f"{screen}.err").read_text()
+        full = "torchrod: standard output: cannot be written (No space left on device); free some space on its disk\n"
+        assert said == (full if screen == "full" else ""), screen
+        (record,) = json.loads((folder / f"{screen}.json").read_text())["results"]
+        assert record["sample"] == name
+    assert "Pr\\xfcfling-\\u03b2" in (folder / "ascii.out").read_text()
 
 
 def test_an_interrupted_command_says_so_in_one_line(folder):
+    """While the processes that it has begun still import torch, or work."""
+    text = (EXAMPLE / "dataset.toml").read_text()
+    (folder / "dataset.toml").write_text(text.replace("shard_size = 5_000", "shard_size = 50"))
     going = subprocess.Popen(
-        [*COMMAND, "simulate-dataset", str(EXAMPLE / "dataset.toml"), "--samples", "3000000", "--out", "d", "--workers", "2"],
+        [*COMMAND, "simulate-dataset", "dataset.toml", "--out", "d", "--workers", "2"],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -197,7 +217,7 @@ def test_a_result_needs_a_name_for_every_sample(fitted, tmp_path):
     for suffix in (".json", ".npz"):
         for names in (["a"], ["a"] * 121):
             with pytest.raises(InputError, match=f"{len(names)} names for 120 samples"):
-                write_result(tmp_path / f"r{suffix}", fitted[1], names, "rod")
+                write_result(tmp_path / f"r{suffix}", Result(fitted[1], names, "rod"))
     assert not list(tmp_path.iterdir())
 
 
@@ -211,8 +231,8 @@ def test_table_and_records_are_linear_in_the_samples(fitted, tmp_path, monkeypat
     counts = []
     for write in (
         lambda: table.table(fitted[1], ["a"] * 120, fitted[2], None),
-        lambda: write_result(tmp_path / "r.json", fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2]),
-        lambda: write_result(tmp_path / "r.npz", fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2]),
+        lambda: write_result(tmp_path / "r.json", Result(fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2])),
+        lambda: write_result(tmp_path / "r.npz", Result(fitted[1], ["a"] * 120, "rod", diagnosis=fitted[2])),
     ):
         asked.clear()
         write()

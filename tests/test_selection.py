@@ -10,6 +10,7 @@ from studies import contacts
 from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
 from torchrod import GaussianLoads, Markers, PointForces, PointWrenches, Problem, estimate, score_test, solve_shape
+from torchrod.analysis.count import Hypothesis, bic, select
 from torchrod.analysis.score_test import start_with_one_more
 from torchrod.cli import main
 from torchrod.estimation.evaluator import evaluator
@@ -120,6 +121,24 @@ def test_a_contact_and_a_push_at_the_tip_are_told_from_two_contacts_and_a_push(t
     results = run(tmp_path, markers, "--contacts", "auto", "--unknown-tip", "force", "--noise", "2e-4")
     right = [sample["evidence"]["chosen"] == "1 + tip force" for sample in results]
     assert sum(right) >= 20
+
+
+@pytest.mark.many_fits
+def test_what_is_not_tried_would_not_have_been_chosen():
+    """The count by stages is that of the least BIC among fits of every count; yet a third load is seldom tried."""
+    random, B = torch.Generator().manual_seed(3), 60
+    size = torch.cat([torch.full((B, 1), 0.8), 0.02 * 50 ** torch.rand(B, 1, generator=random)], -1)
+    turn = 2 * math.pi * torch.rand(B, 2, generator=random)
+    place = T([0.14, 0.3]) + T([0.06, 0.09]) * torch.rand(B, 2, generator=random)
+    force = torch.stack([size * turn.cos(), size * turn.sin(), 0 * size], -1)
+    problem = without_load(markers_of((PointForces(force, place),), B, 4))
+    candidates = [Hypothesis(str(k), k, unknowns_of(steel_rod(), k)) for k in range(4)]
+    _, evidence = select(problem, candidates)
+    every = [problem.of(candidate.unknowns) for candidate in candidates]
+    best = torch.stack([bic(own, estimate(own)) for own in every], -1).argmin(-1)
+    assert torch.equal(evidence.choice, best)
+    assert best.bincount(minlength=3)[1:3].min() > B / 4
+    assert evidence.bic[:, 3].isnan().sum() > B / 2
 
 
 def test_the_start_of_one_more_load_costs_less_than_the_fit_that_was_tested():

@@ -36,7 +36,7 @@ from torchrod.estimation.evaluator import KernelEvaluator, SensorEvaluator, Torc
 from torchrod.model.sensors import RodState
 
 P, L = 6, 0.4
-HASTY = Settings(max_iterations=20, restarts=())
+HASTY = Settings(max_iterations=20, restarts=(), basins=0)
 S = torch.linspace(0.05, 0.4, P, dtype=torch.float64)
 ALONG = torch.linspace(0, L, 13, dtype=torch.float64)
 TURN = torch.linalg.matrix_exp(T([[0.0, -0.3, 0.2], [0.3, 0.0, -0.5], [-0.2, 0.5, 0.0]], dtype=torch.float64))
@@ -395,7 +395,7 @@ def test_a_load_too_few_is_told_without_markers():
     other = study.Push(push.force.flip(0), T([0.12, 0.3]), push.tip)
     u = push.at(study.GRATINGS).u + other.at(study.GRATINGS).u
     problem = Problem(study.ROBOT, study.unknowns(False), [Curvature(study.GRATINGS, u[..., :2], 0.01)])
-    found = analyze(problem, settings=Settings(restarts=()))
+    found = analyze(problem, settings=Settings(restarts=(), basins=0))
     assert not found.estimate.accepted.any()
     assert "does not explain the readings" in found.message(0)
     assert "One more contact" in found.message(0)

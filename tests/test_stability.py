@@ -55,20 +55,24 @@ def leaning(force: np.ndarray, weight: np.ndarray) -> np.ndarray:
     One solution has a tip's angle between 0 and the load's own: the branch that begins without load.
     """
 
-    def march(a: float) -> np.ndarray:
-        def rate(x, y):
-            Fx, Fz = (force[i] + weight[i] * (1 - x) for i in (0, 1))
-            return [y[1], -(Fx * np.cos(y[0]) - Fz * np.sin(y[0])), np.sin(y[0]), np.cos(y[0])]
+    def march(a: np.ndarray) -> np.ndarray:
+        """The angle at the base, its rate, x and z for every angle of the tip."""
 
-        return solve_ivp(rate, (1.0, 0.0), [a, 0.0, 0.0, 0.0], method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+        def rate(x, y):
+            angle, turn = y.reshape(4, -1)[:2]
+            Fx, Fz = (force[i] + weight[i] * (1 - x) for i in (0, 1))
+            return np.concatenate([turn, -(Fx * np.cos(angle) - Fz * np.sin(angle)), np.sin(angle), np.cos(angle)])
+
+        begin = np.concatenate([a, np.zeros(3 * len(a))])
+        return solve_ivp(rate, (1.0, 0.0), begin, method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1].reshape(4, -1)
 
     load = force + weight
     angles = np.linspace(1e-9, math.atan2(load[0], load[1]), 120)
-    missed = np.array([march(a)[0] for a in angles])
+    missed = march(angles)[0]
     (roots,) = np.nonzero(missed[1:] * missed[:-1] < 0)
     assert len(roots) == 1
-    a = brentq(lambda a: march(a)[0], angles[roots[0]], angles[roots[0] + 1], xtol=1e-13)
-    return -L * march(float(a))[2:]  # pyright: ignore[reportArgumentType]
+    a = brentq(lambda a: march(np.array([a]))[0, 0], angles[roots[0]], angles[roots[0] + 1], xtol=1e-13)
+    return -L * march(np.array([a]))[2:, 0]
 
 
 def solved(robot: Robot, force=(0.0, 0.0, 0.0), tension=None):

@@ -42,6 +42,7 @@ from .estimation.solve import paper_settings as paper_settings
 from .estimation.starts import Origin as Origin
 from .estimation.starts import Start as Start
 from .estimation.starts import cold_start as cold_start
+from .io import Result as Result
 from .io import Shapes as Shapes
 from .io import read_robot as read_robot
 from .io import read_shapes as read_shapes

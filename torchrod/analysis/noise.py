@@ -107,8 +107,8 @@ def estimate_noise(
         fit = estimate_each(with_noise(problem, sigma), settings, begin)
         found, freedom = _sigma(problem, fit)
         moved = (found / sigma).log().abs().nan_to_num(0.0)
-        # Not down to nothing in one round: the fit must follow. A sample that has settled stays, whatever its neighbours do.
-        onward = torch.maximum(found.where(torch.isfinite(found), sigma), 0.02 * sigma)
+        # A sample that has settled stays, whatever its neighbours do.
+        onward = found.where(torch.isfinite(found), sigma)
         sigma, nu = torch.where(settled, sigma, onward), torch.where(settled, nu, freedom)
         settled = settled | (moved < SETTLED)
         if bool(settled.all()):

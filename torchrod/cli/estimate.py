@@ -19,6 +19,7 @@ from ..io import (
     RESULT_SUFFIXES,
     NearlyKnown,
     Noises,
+    Result,
     Shapes,
     read_base_pose,
     read_robot,
@@ -242,13 +243,22 @@ def estimate(options: Namespace) -> None:
     if said := _taken_as_exact(options, problem):
         print(said)  # noqa: T201
     if options.out:
-        said = {name: getattr(found, name) for name in ("evidence", "diagnosis", "noise", "places", "intervals")}
-        nearly = problem.unknowns.uncertainty
-        said["parameters"] = [] if nearly is None else [p.name for p in nearly.parameters(robot)]
-        base = read_base_pose(options.robot)
-        base = base if base is None or calibrated is None else base.moved(calibrated.zeta)
-        said |= {"profile": _profile(options, found), "base": base, "time": shapes.time}
-        write_result(options.out, fit, shapes.samples, robot.name, **said)
+        nearly, base = problem.unknowns.uncertainty, read_base_pose(options.robot)
+        result = Result(
+            fit,
+            shapes.samples,
+            robot.name,
+            evidence=found.evidence,
+            profile=_profile(options, found),
+            diagnosis=found.diagnosis,
+            noise=found.noise,
+            places=found.places,
+            base=base if base is None or calibrated is None else base.moved(calibrated.zeta),
+            time=shapes.time,
+            intervals=found.intervals,
+            parameters=() if nearly is None else [p.name for p in nearly.parameters(robot)],
+        )
+        write_result(options.out, result)
     if options.plot:
         _draw(options.plot, robot, shapes, found)
 

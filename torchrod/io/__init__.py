@@ -3,7 +3,7 @@
 from .base_pose import BasePose
 from .calibration_file import CALIBRATION_SUFFIXES, calibrated_by, write_calibration
 from .observability_file import write_observability, write_observability_table
-from .result_file import RESULT_SUFFIXES, read_fit, write_result
+from .result_file import RESULT_SUFFIXES, Result, read_fit, write_result
 from .robot_file import read_base_pose, read_robot
 from .robot_text import write_calibrated
 from .shape_file import read_shapes, write_shapes
@@ -18,6 +18,7 @@ __all__ = [
     "Calibrated",
     "NearlyKnown",
     "Noises",
+    "Result",
     "Shapes",
     "calibrated_by",
     "read_base_pose",

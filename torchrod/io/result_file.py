@@ -5,7 +5,8 @@ import io
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
@@ -61,14 +62,46 @@ LOAD_NUMBERS = {name: field for name, field in WITH_UNITS.items() if name not in
 SPACE = ("force_base_N", "position_m", "force_lab_N", "position_lab_m")
 
 
-def _in_space(estimate: Estimate, places: LoadPlaces | None, base: BasePose | None) -> dict[str, Tensor]:
+@dataclass(frozen=True)
+class Result:
+    """What is written of an estimate of B samples; None and () for what is not known of it.
+
+    samples: their names. robot: its name. evidence: for each number of loads, where it was chosen from the data. profile: f(s) of
+    every sample (torchrod.load_profile). diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where
+    it was estimated. places: of the loads in space (torchrod.Analysis.places). base: where the robot stands in the lab. time: of
+    the samples (s). intervals: from draws of the posterior (estimation.intervals), which then stand in place of the normal ones.
+    parameters: the names of the robot's parameters that were unknown.
+    """
+
+    estimate: Estimate
+    samples: Sequence[str]
+    robot: str
+    evidence: Evidence | None = None
+    profile: Profile | None = None
+    diagnosis: Diagnosis | None = None
+    noise: Noise | None = None
+    places: LoadPlaces | None = None
+    base: BasePose | None = None
+    time: Float[Tensor, " B"] | None = None
+    intervals: Intervals | None = None
+    parameters: Sequence[str] = ()
+
+    @cached_property
+    def messages(self) -> list[str]:
+        """What became of every sample, and what is wrong with it."""
+        said, diagnosis = self.estimate.messages, self.diagnosis
+        return said if diagnosis is None else [f"{text} {diagnosis.message(b)}".rstrip() for b, text in enumerate(said)]
+
+
+def _in_space(result: Result) -> dict[str, Tensor]:
     """Forces and places (B, K, 3) of all loads: in the robot's base frame and, where that is known, in the lab's.
 
     An error of the base frame that was estimated has moved the robot in the lab, not in its own frame.
     """
-    if places is None:
+    estimate, base = result.estimate, result.base
+    if result.places is None:
         return {}
-    force, position = places.force, places.position
+    force, position = result.places.force, result.places.position
     found = {"force_base_N": force, "position_m": position}
     if base is not None:
         zeta = torch.zeros_like(estimate.base_wrench) if estimate.registration is None else estimate.registration
@@ -88,8 +121,9 @@ def _merged(estimate: Estimate, drawn: Intervals | None, name: str) -> Tensor:
     return torch.where(found.isnan(), own, found)
 
 
-def _columns(estimate: Estimate, space: dict[str, Tensor], drawn: Intervals | None) -> Columns:
-    found = {name: getattr(estimate, name) for name in COLUMNS} | space
+def _columns(result: Result) -> Columns:
+    estimate, drawn = result.estimate, result.intervals
+    found = {name: getattr(estimate, name) for name in COLUMNS} | _in_space(result)
     if drawn is not None:
         found |= {f"{name}_interval": _merged(estimate, drawn, name) for name in ("magnitude", "location")}
         found |= {"drawn_force": drawn.force, "resultant": drawn.resultant, "k_hat": drawn.k_hat, "ess": drawn.ess}
@@ -140,12 +174,6 @@ def _solution(other: Solution) -> dict[str, object]:
     loads = [{"force_local_N": f, "location_m": s} for f, s in zip(other.force.tolist(), other.location.tolist(), strict=True)]
     tip = {} if other.tip is None else {"tip": {"force_N": other.tip[:3].tolist(), "moment_Nm": other.tip[3:].tolist()}}
     return {"chi2": other.chi2, "loads": loads, **tip}
-
-
-def _messages(estimate: Estimate, diagnosis: Diagnosis | None) -> list[str]:
-    """What became of every sample, and what is wrong with it."""
-    said = estimate.messages
-    return said if diagnosis is None else [f"{text} {diagnosis.message(b)}".rstrip() for b, text in enumerate(said)]
 
 
 def _record(of: Columns, b: int, sample: str, message: str) -> dict[str, str]:
@@ -224,26 +252,17 @@ def _evidence(evidence: Evidence, b: int) -> dict[str, object]:
     }
 
 
-def _texts(
-    estimate: Estimate,
-    samples: list[str],
-    evidence: Evidence | None,
-    profile: Profile | None,
-    diagnosis: Diagnosis | None,
-    noise: Noise | None,
-    space: dict[str, Tensor],
-    time: list[float] | None,
-    drawn: Intervals | None,
-    parameters: Sequence[str],
-) -> Iterator[str]:
+def _texts(result: Result) -> Iterator[str]:
     """The entry of every sample, one after the other: all of them at once would take more memory than the fit."""
-    of, messages = _columns(estimate, space, drawn), _messages(estimate, diagnosis)
-    for b, name in enumerate(samples):
+    of, messages = _columns(result), result.messages
+    evidence, profile, diagnosis, noise = result.evidence, result.profile, result.diagnosis, result.noise
+    time = None if result.time is None else result.time.tolist()
+    for b, name in enumerate(result.samples):
         record = _record(of, b, name, messages[b])
         if time is not None:
             record["time_s"] = _numbers(time[b])
-        if parameters:
-            found = zip(parameters, of["parameters"][b], of["parameters_std"][b], strict=True)
+        if result.parameters:
+            found = zip(result.parameters, of["parameters"][b], of["parameters_std"][b], strict=True)
             record["parameters"] = _numbers({name: {"error": error, "std": std} for name, error, std in found})
         if evidence is not None:
             record["evidence"] = json.dumps(_evidence(evidence, b))
@@ -258,9 +277,9 @@ def _texts(
         yield "{\n" + ",\n".join(f' "{key}": {text}' for key, text in record.items()) + "\n}"
 
 
-def _load_table(estimate: Estimate, samples: list[str], space: dict[str, Tensor], time: Tensor | None) -> str:
+def _load_table(result: Result) -> str:
     """A row for each load of each sample, the tip's last, and one for a sample without any."""
-    of = _columns(estimate, space, None)
+    of = _columns(replace(result, intervals=None))
     vectors = {"force_local_N": "force", **{name: name for name in SPACE if name in of}}
     parts = {name: "xyz"[: 2 if name == "force_local_N" else 3] for name in vectors}
     single = LOAD_NUMBERS | {name: WITH_UNITS[name] for name in AXIAL if WITH_UNITS[name] in of}
@@ -269,8 +288,8 @@ def _load_table(estimate: Estimate, samples: list[str], space: dict[str, Tensor]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    for b, name in enumerate(samples):
-        head = ["" if time is None else float(time[b]), name, Status(of["status"][b]).label, int(of["accepted"][b])]
+    for b, name in enumerate(result.samples):
+        head = ["" if result.time is None else float(result.time[b]), name, Status(of["status"][b]).label, int(of["accepted"][b])]
         loads = [k for k, v in enumerate(of["location"][b]) if not math.isnan(v)]
         for k in loads:
             numbers = [of[field][b][k] for field in single.values()]
@@ -294,50 +313,15 @@ def _stream(file: IO[bytes], robot: str, texts: Iterator[str]) -> None:
     file.write(b"\n]}\n")
 
 
-def write_result(
-    path: str | Path,
-    estimate: Estimate,
-    samples: list[str],
-    robot: str,
-    evidence: Evidence | None = None,
-    profile: Profile | None = None,
-    diagnosis: Diagnosis | None = None,
-    noise: Noise | None = None,
-    places: LoadPlaces | None = None,
-    base: BasePose | None = None,
-    time: Float[Tensor, " B"] | None = None,
-    intervals: Intervals | None = None,
-    parameters: Sequence[str] = (),
-) -> None:
-    """RESULT.json, RESULT.npz with the fields of torchrod.Estimate as arrays, or LOADS.csv with a row for each load.
-
-    evidence: for each number of loads, where it was chosen from the data. profile: f(s) of every sample (torchrod.load_profile).
-    diagnosis: the mistake behind fits that are not accepted (torchrod.diagnose). noise: where it was estimated.
-    places: of the loads in space (torchrod.Analysis.places). base: where the robot stands in the lab. time: of the samples (s).
-    intervals: intervals from draws of the posterior (estimation.intervals), which then stand in place of the normal ones.
-    parameters: the names of the robot's parameters that were unknown.
-    Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
-    """
-    path = Path(path)
-    if path.suffix not in RESULT_SUFFIXES:
-        raise InputError(f"{path}: results are written as .json, .npz or .csv; change the suffix")
-    if len(samples) != len(estimate.status):
-        raise InputError(f"{path}: {len(samples)} names for {len(estimate.status)} samples; give every sample its name")
-    space = _in_space(estimate, places, base)
-    if path.suffix == ".csv":
-        put_text(path, _load_table(estimate, samples, space, time))
-        return
-    if path.suffix == ".json":
-        seconds = None if time is None else time.tolist()
-        texts = _texts(estimate, samples, evidence, profile, diagnosis, noise, space, seconds, intervals, parameters)
-        put(path, lambda file: _stream(file, json.dumps(robot), texts))
-        return
-    texts = _messages(estimate, diagnosis)
+def _arrays(result: Result) -> dict[str, np.ndarray]:
+    """The content of RESULT.npz."""
+    estimate, evidence, intervals, noise, profile = result.estimate, result.evidence, result.intervals, result.noise, result.profile
+    texts = result.messages
     place = {text: i for i, text in enumerate(sorted(set(texts)))}
-    names = {"sample": np.array(samples), "robot": np.array(robot), "messages": np.array(list(place))}
+    names = {"sample": np.array(result.samples), "robot": np.array(result.robot), "messages": np.array(list(place))}
     names["message"] = np.array([place[text] for text in texts])
-    if parameters:
-        names["parameter_names"] = np.array(list(parameters))
+    if result.parameters:
+        names["parameter_names"] = np.array(list(result.parameters))
     arrays = {f.name: getattr(estimate, f.name) for f in fields(Estimate)}
     if evidence is not None:
         arrays |= {"hypothesis": evidence.choice, "bic": evidence.bic, "bic_foreseen": evidence.foreseen}
@@ -354,10 +338,28 @@ def write_result(
         arrays |= {"noise": noise.sigma, "noise_std": noise.std}
     if profile is not None:
         arrays |= {"profile_s": profile.s, "profile_f": profile.f.float(), "profile_band": profile.band.float()}
-    arrays |= space | {name: getattr(estimate, field) for name, field in WITH_UNITS.items()} | {"time_s": time}
-    content = names | {k: v.numpy() for k, v in arrays.items() if v is not None}
-    # Uncompressed: deflating random digits takes six times as long as estimating them, and saves a third.
-    put(path, lambda file: np.savez(file, **content))  # pyright: ignore[reportArgumentType]
+    arrays |= _in_space(result) | {name: getattr(estimate, field) for name, field in WITH_UNITS.items()} | {"time_s": result.time}
+    return names | {k: v.numpy() for k, v in arrays.items() if v is not None}
+
+
+def write_result(path: str | Path, result: Result) -> None:
+    """RESULT.json, RESULT.npz with the fields of torchrod.Estimate as arrays, or LOADS.csv with a row for each load.
+
+    Errors: InputError for another suffix, for more or fewer names than samples, and where the file cannot be written.
+    """
+    path, samples = Path(path), len(result.estimate.status)
+    if path.suffix not in RESULT_SUFFIXES:
+        raise InputError(f"{path}: results are written as .json, .npz or .csv; change the suffix")
+    if len(result.samples) != samples:
+        raise InputError(f"{path}: {len(result.samples)} names for {samples} samples; give every sample its name")
+    if path.suffix == ".csv":
+        put_text(path, _load_table(result))
+    elif path.suffix == ".json":
+        put(path, lambda file: _stream(file, json.dumps(result.robot), _texts(result)))
+    else:
+        content = _arrays(result)
+        # Uncompressed: deflating random digits takes six times as long as estimating them, and saves a third.
+        put(path, lambda file: np.savez(file, **content))  # pyright: ignore[reportArgumentType]
 
 
 @dataclass(frozen=True)

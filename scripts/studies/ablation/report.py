@@ -22,7 +22,7 @@ Made by `python scripts/ablation.py{options}`: every figure below is computed wh
 A small network looks at the markers and guesses the loads; a forward solve fills in the base wrench, and the filter starts
 there instead of from no load. The guess cannot do much harm: it is used only where it lies nearer to the data than a cold
 start, and a fit from it that is not accepted is followed by a cold start (`iterations` counts both). The answer is a minimum
-of the same cost, so what changes is the way there. `torchrod.find_warm_start(model)` picks the checkpoint that serves a robot
+of the same cost, so what changes is the way there. `torchrod.find_warm_start(problem)` picks the checkpoint that serves a robot
 and its number of loads, or none: then the start is cold.
 """
 METHOD = """
