@@ -33,7 +33,7 @@ from torchrod.estimation import filter as ekf
 from torchrod.estimation.evaluator import KernelEvaluator, Run, TorchEvaluator, evaluator, normal
 from torchrod.estimation.walk import kernel_walks
 from torchrod.mechanics.lie import move
-from torchrod.mechanics.tendons import Tendon, Tendons
+from torchrod.mechanics.tendons import LEAK, Tendon, Tendons
 from torchrod.model.problem import TIP_FORCE_STD, TIP_MOMENT_STD
 
 pytestmark = needs_compiler
@@ -124,24 +124,26 @@ def test_h_jacobian_and_normal_equations(robot, family, frame):
 
 
 def test_tensions_about_zero():
-    """tau = (r + w)^2 / (4 w) within +-w of a reading r of 0, else max(r, 0); by both paths."""
+    """tau = (1 - e) (r + w)^2 / (4 w) + e r within +-w of a reading r of 0, else r, or e r below; by both paths."""
     std, w = 0.5, 0.05
+
+    def eased(r: torch.Tensor, w: float) -> torch.Tensor:
+        return torch.where(r < w, (1 - LEAK) * (r + w).clamp(min=0) ** 2 / (4 * w) + LEAK * r, r)
+
     problem, x = case(hanging(), GaussianCoordinates(1, 0.4, 1.0), tension_std=std)
     problem = replace(problem, tension=torch.zeros(B, 2))
     r = T([[-1.0, 0.03], [-0.049, 0.05], [0.0, 0.2], [0.049, -0.05], [-0.02, 0.051]])
     x[:, problem.state.tension.at] = r / std
-    expected = torch.where(r.abs() < w, (r + w) ** 2 / (4 * w), r.clamp(min=0))
     pulling = problem.pulling(x)
     assert pulling is not None
-    assert torch.allclose(pulling, expected, rtol=0, atol=1e-15)
+    assert torch.allclose(pulling, eased(r, w), rtol=0, atol=1e-15)
     check_agreement(problem, x)
     tendons = tuple(replace(t, tension_gain=1.5, tension_offset=0.01) for t in hanging().tendons.tendons)
     gains = replace(problem, robot=replace(problem.robot, tendons=Tendons(tendons)))
     assert not kernel_walks(gains)  # whose errors are of tensions, not of readings
-    tau, w = 1.5 * r + 0.01, 1.5 * w
-    expected, pulling = torch.where(tau.abs() < w, (tau + w) ** 2 / (4 * w), tau.clamp(min=0)), gains.pulling(x)
+    pulling = gains.pulling(x)
     assert pulling is not None
-    assert torch.allclose(gains.robot.tendons.true_tension(pulling), expected, rtol=0, atol=1e-15)
+    assert torch.allclose(gains.as_pulled.tendons.true_tension(pulling), eased(1.5 * r + 0.01, 1.5 * w), rtol=0, atol=1e-15)
 
 
 def test_fits_settle_where_a_tendon_goes_slack():
@@ -159,6 +161,18 @@ def test_fits_settle_where_a_tendon_goes_slack():
     assert fit.accepted.double().mean() > 0.98
     z = (fit.magnitude[:, 0] - force[:, 0].norm(dim=-1)) / fit.magnitude_std[:, 0]
     assert 0.9 < float((z.abs() < 1.96).double().mean()) < 0.99
+
+
+def test_fits_settle_where_the_shape_asks_a_slack_tendon_to_push():
+    """A rod a tenth stiffer than its file says, and a tendon that reads 0 +- 1 N; without the leak some do not settle."""
+    robot, n, g = Robot(steel_rod().rod, Tendons((Tendon.straight(0.007, 0.0, 0.4),))), 100, torch.Generator().manual_seed(7)
+    push = torch.zeros(n, 1, 3)
+    push[:, 0, 0] = 0.2 + 0.6 * torch.rand(n, generator=g)
+    s, at = torch.linspace(0.02, 0.4, 20), 0.15 + 0.2 * torch.rand(n, 1, generator=g)
+    p = solve_shape(robot, (PointForces(push / 1.1, at),), torch.zeros(n, 1), s, n).p
+    p = p + 1e-3 * torch.randn(p.shape, generator=g)
+    fit = estimate(posed(s, p, 1e-3, robot, GaussianCoordinates(1, 0.4, 1.0, "point"), torch.zeros(n, 1), tension_std=1.0))
+    assert (fit.status == 0).all()
 
 
 @pytest.mark.parametrize("family", DRAGGING)

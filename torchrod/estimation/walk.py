@@ -15,6 +15,7 @@ from ..mechanics.integrate import known
 from ..mechanics.loads import total
 from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
+from ..mechanics.tendons import LEAK
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates, SmoothCoordinates
 from ..model.load_families.family import FAINT
 from ..model.problem import SLACK, TIP_ROWS, Problem
@@ -172,6 +173,7 @@ def _units(problem: Problem) -> dict[str, float]:
         "length_unit": unit(state.registration.unit, 0),
         "angle_unit": unit(state.registration.unit, 3),
         "tension_unit": unit(state.tension.unit, 0),
+        "leak": LEAK,
         "slack": SLACK * unit(state.tension.unit, 0),
     }
 
@@ -249,7 +251,7 @@ def _tables(problem: Problem, nu: float, x: Float[Tensor, "B n"] | None, reading
     tensors, counts = layout.tensors | {"positions": positions, "w": w}, layout.counts
     if layout.active is not None and problem.tension is not None:
         # Where a tension is unknown the kernel adds its error, and only then is it clamped at zero.
-        tension = robot.tendons.true_tension(problem.tension, clamped=not problem.state.tension.size)
+        tension = problem.as_pulled.tendons.true_tension(problem.tension)
         tensors["tau"] = tension[:, None, None, :] * layout.active
         counts = counts | {"newton": robot.tendons.newton_steps(*robot.rod.sampled_stiffness, tension)}
     return kernel.FitTables.of(kernel.with_rows(tensors, problem.batch), counts, layout.numbers | {"robust": nu})

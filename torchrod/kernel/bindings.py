@@ -71,7 +71,7 @@ class CTask(ctypes.Structure):
         ("known", CKnown),
         ("loads", CLoads),
         *((n, _I) for n in ("size", "tip", "tensions", "registration")),
-        *((n, _D) for n in ("force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "slack", "robust")),
+        *((n, _D) for n in ("force_unit", "moment_unit", "length_unit", "angle_unit", "tension_unit", "slack", "leak", "robust")),
         ("offsets", _P),
         *((n, CTable) for n in ("active", "weight")),
         *((n, _P) for n in ("positions", "w")),

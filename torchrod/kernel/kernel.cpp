@@ -31,7 +31,7 @@ void torchrod_march(const March* m, int64_t threads) {
     const Known& known = m->known;
     const int64_t n = m->tangents, g = m->load_tangents, points = 3 * known.steps;
     in_groups(m->batch, nullptr, threads, [&](const Lanes& lanes, Room& room, std::vector<V>&) {
-        Group group{&known, lanes, n, g, 0, 0, 0, nullptr, nullptr, nullptr, {}, {}};
+        Group group{&known, lanes, n, g, 0, 0, 0, 0, nullptr, nullptr, nullptr, {}, {}};
         group.stretching = true;  // whoever calls may ask for any tangent
         if (m->local) {
             room.local.resize((points + 1) * (1 + g) * PARTS);

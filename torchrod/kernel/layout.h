@@ -44,7 +44,7 @@ inline std::string structures_and_constants() {
     BEGIN(Loads) F(family), F(count), F(per_load), F(size), F(axial), F(length), F(force_scale), F(eps), F(beta1), F(beta2), F(friction), F(faint), F(locations),
         F(basis), F(s), F(inside), F(node) END
     BEGIN(Task) F(known), F(loads), F(size), F(tip), F(tensions), F(registration), F(force_unit), F(moment_unit), F(length_unit),
-        F(angle_unit), F(tension_unit), F(slack), F(robust), F(offsets), F(active), F(weight), F(positions), F(w) END
+        F(angle_unit), F(tension_unit), F(slack), F(leak), F(robust), F(offsets), F(active), F(weight), F(positions), F(w) END
     BEGIN(Filter) F(mean), F(precision), F(Q), F(step), F(decrement), F(share), F(settled), F(gain), F(exact), F(x), F(Sigma), F(before), F(cap), F(reach), F(Sigma0),
         F(done) END
     BEGIN(Sums) F(A), F(g), F(cost), F(C), F(r), F(line) END

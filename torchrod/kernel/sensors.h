@@ -11,7 +11,7 @@ struct Task {
     Known known;
     Loads loads;
     int64_t size, tip, tensions, registration;  // entries of x in all, of the unknown wrench at the tip, of free tensions; flag
-    double force_unit, moment_unit, length_unit, angle_unit, tension_unit, slack;
+    double force_unit, moment_unit, length_unit, angle_unit, tension_unit, slack, leak;
     double robust;                  // degrees of freedom of Student's t, infinite for a normal distribution
     const double* offsets;          // (P, 3) or null
     Table active, weight;           // (S, 3, T) or none; (3) N/m: what hangs per metre, for nodes that move
@@ -78,7 +78,7 @@ template <class X> Group group_of(const Task& f, const Lanes& lanes, X x, bool s
     room.tension.resize(f.tensions);
     for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(g + f.tip + t);
     const int64_t tangents = slopes ? g + f.tensions + PLAIN : 0;
-    Group group{&m, lanes, tangents, slopes ? g : 0, f.tensions, f.tension_unit, f.slack, room.tension.data(), nullptr, nullptr, f.weight, f.active};
+    Group group{&m, lanes, tangents, slopes ? g : 0, f.tensions, f.tension_unit, f.slack, f.leak, room.tension.data(), nullptr, nullptr, f.weight, f.active};
     group.turning = f.offsets || f.tip;
     if (f.loads.family == POINT && slopes) {
         room.moves.resize((m.steps + 1) * g);

@@ -77,7 +77,7 @@ struct Group {
     Lanes lanes;
     int64_t tangents, load_tangents, tension_tangents;
     double tension_unit;  // N, of one unit of a tension tangent
-    double slack;         // N, within which of zero a tension has no kink
+    double slack, leak;   // N, within which of zero a tension has no kink, and the slope that is left below
     const V* tension;     // (tension_tangents), what the tensions' unknowns add (N)
     const V* local;       // (3 S + 1, 1 + load_tangents, PARTS): the stages of every step, then beyond the tip; or null
     const V* node_moves;  // (S + 1, load_tangents): how the nodes move; null where they do not
@@ -119,7 +119,8 @@ inline void stage_of(const Group& g, int64_t row, Stage& s) {
         const V pull = s.tau[t] + g.tension[t];
         const V above = larger(pull + g.slack, V{});
         const Mask eased = pull < g.slack;
-        s.tau[t] = select(on, select(eased, above * above * (0.25 / g.slack), pull), V{});
-        s.tau_unit[t] = select(on, g.tension_unit * select(eased, above * (0.5 / g.slack), splat(1.0)), V{});
+        const double share = 1 - g.leak;
+        s.tau[t] = select(on, select(eased, above * above * (share * 0.25 / g.slack) + g.leak * pull, pull), V{});
+        s.tau_unit[t] = select(on, g.tension_unit * select(eased, above * (share * 0.5 / g.slack) + g.leak, splat(1.0)), V{});
     }
 }

@@ -17,6 +17,7 @@ NEWTON_STEPS = 3
 NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stiffness
 SOFT = 0.1  # this much of it
 STRAIGHT = 1e-3  # rad over the longest tendon: the turning below which a path is as good as straight
+LEAK = 0.02  # the slope below which no tension falls that is unknown
 SETTLED = 1e-7  # relative change of the strains that further steps may still make
 Strains = Float[Tensor, "... 6"]
 
@@ -132,9 +133,10 @@ class TendonTable:
 
 @dataclass(frozen=True)
 class Tendons:
-    """The robot's tendons; an empty tuple is a passive rod."""
+    """The robot's tendons; an empty tuple is a passive rod. clamped: whether tensions below zero are none; not of `eased`."""
 
     tendons: tuple[Tendon, ...] = field(default=())
+    clamped: bool = True
 
     def __len__(self) -> int:
         return len(self.tendons)
@@ -155,11 +157,11 @@ class Tendons:
         mu = [t.friction * t.motion for t in self.tendons]
         return torch.tensor(mu, dtype=DTYPE) if any(mu) else None
 
-    def true_tension(self, reading: Float[Tensor, "... T"], clamped: bool = True) -> Float[Tensor, "... T"]:
-        """tau = max(gain reading + offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (if `clamped`)."""
+    def true_tension(self, reading: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+        """tau = max(gain reading + offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (where `clamped`)."""
         gain, offset = self._cells
         tau = gain * reading + offset
-        return tau.clamp(min=0.0) if clamped else tau
+        return tau.clamp(min=0.0) if self.clamped else tau
 
     @property
     def _cells(self) -> tuple[Float[Tensor, " T"], Float[Tensor, " T"]]:
@@ -168,13 +170,16 @@ class Tendons:
         return gain, offset
 
     def eased(self, reading: Float[Tensor, "... T"], width: Float[Tensor, " T"]) -> Float[Tensor, "... T"]:
-        """Readings (N) whose true tensions have no kink where a tendon goes slack: for tau within +-w of 0
+        """Readings (N) whose true tensions have no kink where a tendon goes slack: for tau within +-w of 0, and below,
 
-        max(tau, 0)  ->  (tau + w)^2 / (4 w),    w: width (N) of a reading, as the load cell's gain makes a tension of it
+        max(tau, 0)  ->  (1 - e) (tau + w)^2 / (4 w) + e tau,    (1 - e) 0 + e tau
+
+        w: width (N) of a reading, as the load cell's gain makes a tension of it. e: LEAK, by which a filter that is to lower the
+        tension still feels that it cannot: without it, it would step from below -w to the prior's mean and back.
         """
         gain, offset = self._cells
         tau, w = gain * reading + offset, gain * width
-        eased = torch.where(tau < w, (tau + w).clamp(min=0.0).square() / (4 * w), tau)
+        eased = torch.where(tau < w, (1 - LEAK) * (tau + w).clamp(min=0.0).square() / (4 * w) + LEAK * tau, tau)
         return torch.where(tau < w, (eased - offset) / gain, reading)
 
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:

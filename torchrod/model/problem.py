@@ -301,13 +301,19 @@ class Problem(Float64):
         tension, found = self.state.tension, self.tensions(x)
         return found if found is None or not tension.size else self.robot.tendons.eased(found, SLACK * tension.unit)
 
+    @cached_property
+    def as_pulled(self) -> Robot:
+        """The robot that `pulling` is of: where a tension is unknown it may fall below zero by a little."""
+        robot = self.robot
+        return robot if not self.state.tension.size else replace(robot, tendons=replace(robot.tendons, clamped=False))
+
     def shape(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Shape:
         """The rod at the sensors' arc lengths, in its own base frame; what is only nearly known of it as its file has it."""
         state = self.state
         if state.parameters.size:
             return self.exact.shape(self.without_parameters(x)[0], differentiable)
         loads = self.unknowns.loads.loads(x[..., state.loads.at])
-        return shape_from_base(self.robot, loads, state.base.of(x), self.pulling(x), self.s, self.steps, differentiable)
+        return shape_from_base(self.as_pulled, loads, state.base.of(x), self.pulling(x), self.s, self.steps, differentiable)
 
     def h(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Float[Tensor, "... z"]:
         """[rows of every sensor, c (N, N m)]: what the sensors would read, in their units, then the tip residual."""
@@ -405,7 +411,7 @@ class Problem(Float64):
                 "curvatures, strains and uncertain arc lengths are not worked out where tendons rub; remove friction from "
                 "[[tendons]], or leave those readings out"
             )
-        table = stage_table(robot, loads, self.pulling(x), Places(self.s[at])).stage(0)
+        table = stage_table(self.as_pulled, loads, self.pulling(x), Places(self.s[at])).stage(0)
         q = y[..., 3:7]
         rate = derivative(Section.of(robot.rod.K_se, robot.rod.K_bt), y, table)
         return unrotate(q, rate[..., :3]), 2 * product(conjugate(q), rate[..., 3:7])[..., :3]
