@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from studies.reproduction import tables
 
 from tests.problems import posed
 from tests.robots import T, busy_robot, steel_rod
@@ -164,15 +165,10 @@ def test_fits_settle_where_a_tendon_goes_slack():
 
 
 def test_fits_settle_where_the_shape_asks_a_slack_tendon_to_push():
-    """A rod a tenth stiffer than its file says, and a tendon that reads 0 +- 1 N; without the leak some do not settle."""
-    robot, n, g = Robot(steel_rod().rod, Tendons((Tendon.straight(0.007, 0.0, 0.4),))), 100, torch.Generator().manual_seed(7)
-    push = torch.zeros(n, 1, 3)
-    push[:, 0, 0] = 0.2 + 0.6 * torch.rand(n, generator=g)
-    s, at = torch.linspace(0.02, 0.4, 20), 0.15 + 0.2 * torch.rand(n, 1, generator=g)
-    p = solve_shape(robot, (PointForces(push / 1.1, at),), torch.zeros(n, 1), s, n).p
-    p = p + 1e-3 * torch.randn(p.shape, generator=g)
-    fit = estimate(posed(s, p, 1e-3, robot, GaussianCoordinates(1, 0.4, 1.0, "point"), torch.zeros(n, 1), tension_std=1.0))
-    assert (fit.status == 0).all()
+    """Cases 8 and 9 of Table I, robots that are 3 % off, read as 0 +- 1 N: without the leak 14 and 20 % did not settle."""
+    cases = [case for case in tables.read_cases() if case.table == "I" and case.pair in ("8", "9")]
+    for _, fit, at in tables.fitted(cases, 50).values():
+        assert (fit.status[at] == 0).all()
 
 
 @pytest.mark.parametrize("family", DRAGGING)
