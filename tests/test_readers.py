@@ -385,3 +385,12 @@ def test_tensions_over_time(tmp_path, capsys):
         assert main([*command, "--tensions", str(tmp_path / "t.csv")]) == 2
         said = capsys.readouterr().err
         assert words in said and said.count("\n") == 1
+
+
+def test_a_refusal_repeats_no_name_of_thousands_of_letters():
+    """But a path whole."""
+    path = "a/" * 100 + "rod.toml"
+    said = str(InputError(f"{path}: unknown key '{'k' * 5000}'; known: length"))
+    assert path in said
+    assert said.endswith("; known: length")
+    assert len(said) < 400

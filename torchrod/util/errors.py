@@ -1,11 +1,16 @@
 """The one error that a person's input can cause."""
 
+import re
+
+MOST_SHOWN = 80  # letters
+MOST_IN_A_WORD = 400  # a path may be long; a name of thousands of letters that a damaged file holds is not repeated
+
 
 class InputError(ValueError):
     """Input that cannot be used; its text is one sentence naming the file, the key and the remedy."""
 
-
-MOST_SHOWN = 80  # letters
+    def __init__(self, said: str):
+        super().__init__(re.sub(rf"\S{{{MOST_IN_A_WORD},}}", lambda word: f"{word[0][:MOST_SHOWN]}...", said))
 
 
 def shown(value: object) -> str:

@@ -46,7 +46,7 @@ that hold the truth, of converged samples, first with the robot taken as exact, 
 | what is off | noise (% of L) | exact: accepted | force / place (%) | stated: accepted | force / place (%) | error of place (mm) |
 |---|---|---|---|---|---|---|"""
 REPEATED = """
-With 200 cases a share below 93 % is chance as a rule. Of the rows with 91 or 92 %, with 1000 cases of other draws: three tendons,
+Two of the rows with 91 or 92 %, repeated with 1000 cases of other draws: three tendons,
 stiffness 10 %, 0.1 %: force 94.2, place 95.0 (z-scores of RMS 1.02 and 1.02); passive, frame, 0.1 %: 93.7, 94.0 (1.05 and 1.05)."""
 CONTACTS = """
 ### Whether anything pushes
