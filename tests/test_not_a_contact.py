@@ -141,6 +141,7 @@ def bent(robot: tr.Robot, push: int, random: torch.Generator, B: int) -> tr.Prob
 
 
 @pytest.mark.many_fits
+@pytest.mark.study
 def test_a_bend_that_no_file_knows_is_not_more_contacts():
     """Alone, or beside a push: where one contact more explains it by opposite ones side by side, on every robot."""
     random, couples = torch.Generator().manual_seed(3), []
