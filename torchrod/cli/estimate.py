@@ -135,11 +135,8 @@ def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
     quick = kernel_walks(problem) and not options.one_frame
     if options.intervals == "sampled" or not quick:
         return options.intervals == "sampled"
-    few = (
-        problem.batch <= MOST_PROFILES
-        if kernel_serves(problem)
-        else problem.batch <= MOST_DRAWN and len(problem.groups) <= MOST_READINGS
-    )
+    plain = kernel_serves(problem) and not (problem.state.tip.size or problem.state.tension.size)
+    few = problem.batch <= MOST_PROFILES if plain else problem.batch <= MOST_DRAWN and len(problem.groups) <= MOST_READINGS
     if not few:
         warnings.warn(
             f"the intervals of {problem.batch} samples are those of the covariance"

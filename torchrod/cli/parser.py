@@ -104,7 +104,8 @@ def _estimate_parser() -> ArgumentParser:
         default="auto",
         help="what the 95-percent intervals in RESULT come from: draws of the posterior (10 ms a shape, more where "
         "hypotheses compete) or the covariance; "
-        "auto: draws for up to 1,000 samples of markers, 100 of other sensors, on a robot that is taken as exact",
+        "auto: draws for up to 1,000 samples of markers on a robot that is taken as exact, 100 where other sensors read or "
+        "something at the tip or tensions are unknown (20 ms to 3 s a shape)",
     )
     parser.add_argument("--out", type=str, default=None, help="RESULT.json or RESULT.npz, or LOADS.csv: a row for each load")
     about = "whether RESULT has the load profiles and their bands; auto: up to 1,000 samples"

@@ -128,8 +128,8 @@ def place_and_tip(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, 
 
 
 def cheapest(problem: Problem, fit: Estimate, fitting: Fitting) -> Estimate:
-    """The fit of least cost, of every sample that has converged: of `fit` and of pushes_elsewhere."""
-    index = (fit.status == int(Status.CONVERGED)).nonzero().squeeze(-1)
+    """The fit of least cost, of every sample that can be fitted: of `fit` and of pushes_elsewhere."""
+    index = ((fit.status != int(Status.INVALID)) & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
     if not beside_the_tip(problem) or not len(index):
         return fit
     others = pushes_elsewhere(problem.take(index), fit.x[index], fitting)

@@ -84,7 +84,7 @@ class Problem(Float64):
         object.__setattr__(self, "sensors", tuple(self.sensors))
         if self.steps == 0:
             known = bool(self.sensors) and bool(on_rod(self.s, self.robot.rod.length).all())  # else `check` says what is wrong
-            object.__setattr__(self, "steps", steps_of_rod(self.robot, self.s) if known else DEFAULT_STEPS)
+            object.__setattr__(self, "steps", steps_of_rod(self.robot, self.s) if known and len(self.s) else DEFAULT_STEPS)
 
     # What is unknown.
 
