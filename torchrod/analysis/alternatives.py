@@ -114,17 +114,18 @@ def other_solutions(
     few = read_at_few_places(problem)
     for unknowns, index in parts:
         own = problem.of(unknowns)
-        asked = index[fit.accepted[index] & (few[index] | beside_the_tip(own))]
-        for rows in asked.split(CHUNK) if len(asked) else ():
+        pushed = beside_the_tip(own)
+        asked = [index[fit.accepted[index] & few[index]], index[fit.accepted[index] & ~few[index] & pushed]]
+        for rows in (chunk for wanted in asked if len(wanted) for chunk in wanted.split(CHUNK)):
             with one_thread(True):  # many small tensors, which several threads wait for longer than they work at
-                each = _others(own.take(rows), fit.x[rows, : own.size], settings)
+                each = _others(own.take(rows), fit.x[rows, : own.size], settings, bool(few[rows[0]]))
             for b, others in zip(rows.tolist(), each, strict=True):
                 found[b] = others
     return tuple(found)
 
 
-def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings) -> list[tuple[Solution, ...]]:
-    """Of samples whose fits are x."""
+def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings, few: bool) -> list[tuple[Solution, ...]]:
+    """Of samples whose fits are x. few: read at few places, else pushed beside an unknown force at the tip."""
 
     def fitting(problem: Problem, start: Start) -> Estimate:
         return estimate_each(problem, settings, start)
@@ -132,10 +133,10 @@ def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings) -> li
     def rods(problem: Problem, x: Float[Tensor, "N n"]) -> Float[Tensor, "N K 3"]:
         return shape_at(problem, x).p
 
-    if beside_the_tip(problem):
-        others = pushes_elsewhere(problem, x, fitting)
-    else:
+    if few:
         others = other_fits(problem, x, *_starts(problem), rods, SAME * problem.robot.rod.length, fitting)
+    else:
+        others = pushes_elsewhere(problem, x, fitting)
     found: list[list[Solution]] = [[] for _ in range(problem.batch)]
     if others is not None:
         tried, of = others

@@ -250,7 +250,7 @@ def _tables(problem: Problem, nu: float, x: Float[Tensor, "B n"] | None, reading
         return layout.shared.with_rows(positions, w, nu)
     tensors, counts = layout.tensors | {"positions": positions, "w": w}, layout.counts
     if layout.active is not None and problem.tension is not None:
-        # Where a tension is unknown the kernel adds its error, and only then is it clamped at zero.
+        # Where a tension is unknown the kernel adds its error and eases it about zero: it is handed as it was read.
         tension = problem.as_pulled.tendons.true_tension(problem.tension)
         tensors["tau"] = tension[:, None, None, :] * layout.active
         counts = counts | {"newton": robot.tendons.newton_steps(*robot.rod.sampled_stiffness, tension)}

@@ -17,7 +17,7 @@ NEWTON_STEPS = 3
 NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stiffness
 SOFT = 0.1  # this much of it
 STRAIGHT = 1e-3  # rad over the longest tendon: the turning below which a path is as good as straight
-LEAK = 0.02  # the slope below which no tension falls that is unknown
+LEAK = 0.02  # of an unknown tension below slack: the slope that a filter still feels
 SETTLED = 1e-7  # relative change of the strains that further steps may still make
 Strains = Float[Tensor, "... 6"]
 
