@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -226,6 +227,18 @@ def test_of_two_explanations_of_a_compressed_rod_the_cheaper_is_reported_and_bot
         places = torch.cat([fit.location[b], *(other.location for other in told[b])])
         axial = torch.stack([t[2] for t in (fit.tip[b], *(other.tip for other in told[b])) if t is not None]) / scale
         assert ((places - there.location[b]).abs() / 0.4 + (axial - there.tip[b, 2] / scale).abs()).min() < 0.1, b
+
+
+def test_a_fit_without_a_shape_is_looked_for_nowhere():
+    """But its neighbours are."""
+    problem, _, _, _ = compressed(3, 0.8, 1.5, 0)
+    fit = estimate(problem)
+    x = fit.x.clone()
+    x[1] = 1e200
+    told = other_solutions(problem, replace(fit, x=x), [(problem.unknowns, torch.arange(3))])
+    alone = other_solutions(problem, fit, [(problem.unknowns, torch.arange(3))])
+    assert not told[1]
+    assert [len(found) for found in (told[0], told[2])] == [len(found) for found in (alone[0], alone[2])]
 
 
 @pytest.mark.study

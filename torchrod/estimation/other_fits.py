@@ -166,7 +166,8 @@ def pushes_elsewhere(problem: Problem, x: Float[Tensor, "B n"], fitting: Fitting
         _, M_tip = forces(start, everyone)
         axes = rotate(shape.q[:, k].unsqueeze(1), torch.eye(3, dtype=DTYPE)[:2])
         by = cross(shape.p[:, k].unsqueeze(1), axes)[..., :2].mT
-        F = torch.linalg.lstsq(by, (M - M_tip)[:, :2].unsqueeze(-1)).solution.squeeze(-1) / rod.force_scale
+        asked = (M - M_tip)[:, :2].unsqueeze(-1)
+        F = torch.linalg.lstsq(by.nan_to_num(0.0), asked.nan_to_num(0.0)).solution.squeeze(-1) / rod.force_scale
         start[:, push : push + 2] = F * (MOST_FORCE / F.norm(dim=-1, keepdim=True).clamp(min=1e-12)).clamp(max=1.0)
         off, M_off = (a - b for a, b in zip(forces(start, everyone), (n, M), strict=True))
         start[:, state.base.at] += torch.cat([off, M_off], -1) / state.base.unit
@@ -176,4 +177,6 @@ def pushes_elsewhere(problem: Problem, x: Float[Tensor, "B n"], fitting: Fitting
     def looks(part: Problem, x: Float[Tensor, "N n"]) -> Float[Tensor, "N 4 1"]:
         return place_and_tip(part, x).unsqueeze(-1)
 
-    return other_fits(problem, x, torch.cat(starts), torch.cat(of), looks, ALIKE, fitting)
+    every, of_every = torch.cat(starts), torch.cat(of)
+    sound = torch.isfinite(every).all(-1)  # not of a fit that has gone so far astray that it has no shape
+    return other_fits(problem, x, every[sound], of_every[sound], looks, ALIKE, fitting)
