@@ -14,6 +14,7 @@ from torch import Tensor
 from tests.conftest import SHARED
 from tests.robots import T, steel_rod
 from torchrod import (
+    BaseWrench,
     GaussianCoordinates,
     GaussianLoads,
     Markers,
@@ -253,3 +254,32 @@ def test_there_are_no_draws_where_nothing_has_converged():
     fit = estimate(problem, Settings(max_iterations=1, restarts=(), basins=0))
     assert not fit.accepted.any()
     assert sampled_intervals(problem, fit).magnitude.isnan().all()
+
+
+def test_a_push_across_a_strip_has_both_signs_unless_the_base_is_read():
+    """Markers see how the soft side gives way, which is alike for both: one sign was once reported as if it were known."""
+    robot, generator, B = strip(1e6), torch.Generator().manual_seed(3), 24
+    scale = robot.rod.force_scale
+    across = scale * (0.4 + 0.6 * torch.rand(B, generator=generator)) * torch.tensor([1.0, -1.0]).repeat(B // 2)
+    soft = 1e-3 * scale * (1 + torch.rand(B, generator=generator))
+    force, place = torch.stack([soft, across], -1), L * (0.5 + 0.3 * torch.rand(B, 1, generator=generator))
+    s = torch.linspace(L / 20, L, 20)
+    shape = solve_shape(robot, (PointForces(torch.nn.functional.pad(force, (0, 1)).unsqueeze(1), place),), None, s, B, steps=160)
+    p = shape.p + 1e-3 * L * torch.randn(shape.p.shape, generator=generator)
+    unknowns = Unknowns(GaussianCoordinates(1, L, scale, "point"))
+    markers = Markers(s, p, 1e-3 * L)
+    problem = Problem(robot, unknowns, [markers])
+    found = analyze(problem, sampled=True)
+    assert found.estimate.accepted.all() and found.intervals is not None
+    low, high = found.intervals.force[:, 0, 1].unbind(-1)
+    held = (low <= across) & (across <= high)
+    told = torch.tensor([len(others) > 0 for others in found.diagnosis.others])
+    assert held.double().mean() > 0.85
+    assert (low * high < 0).double().mean() > 0.85  # of a push that does not show at all, one broad fit has both signs
+    assert told.double().mean() > 0.3
+    assert bool((low * high < 0)[told].all())
+    assert "measure the force under the base" in found.message(int(told.nonzero()[0]))
+    base = BaseWrench(shape.base_wrench, 0.05 * scale, 0.05 * scale * L)
+    known = analyze(Problem(robot, unknowns, [markers, base]))
+    assert ((known.estimate.force[:, 0, 1] > 0) == (across > 0)).all()
+    assert not any(known.diagnosis.others)

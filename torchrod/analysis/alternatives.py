@@ -1,4 +1,4 @@
-"""Other equilibria that explain the same readings, where a rod is read at few places, or pushed beside an unknown force at its tip.
+"""Other equilibria that explain the same readings, where a rod is read at few places, or has several (estimation.elsewhere).
 
 A tip pose alone, say, fits a rod that bends to either side. The fit that is reported is one of them; the others are looked for from
 loads, and wrenches at the tip, of several sizes and directions, and told with their cost.
@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..estimation.other_fits import beside_the_tip, other_fits, pushes_elsewhere, shape_at
+from ..estimation.elsewhere import elsewhere, fits_elsewhere
+from ..estimation.other_fits import other_fits, shape_at
 from ..estimation.result import Estimate
 from ..estimation.solve import Settings, estimate_each
 from ..estimation.starts import Start
@@ -26,28 +27,26 @@ FEW_PLACES = 3  # along the rod: with more of them a rod that is fitted is as a 
 TIP_SIZES = (1.0, 3.0)  # force and moment scales of the starts
 SAME = 1e-3  # of the length: fits whose rods lie closer together than that everywhere are one
 CHUNK = 256  # samples at a time
+MORE_SENSORS = "add sensors along the rod"
 
 
 @dataclass(frozen=True)
 class Solution:
-    """One other equilibrium of a sample: chi2, forces (K, 2) N at (K,) m, the unknown wrench (6,) [N, N m] at the tip or None."""
+    """One other equilibrium of a sample: chi2, forces (K, 2) N at (K,) m, section frame, the unknown wrench (6,) [N, N m] at the
+    tip or None. remedy: what tells it from the fit.
+    """
 
     chi2: float
     force: Float[Tensor, "K 2"]
     location: Float[Tensor, " K"]
     tip: Float[Tensor, " 6"] | None
-
-    @property
-    def push(self) -> bool:
-        """Whether something pushes beside a force at the tip."""
-        return self.tip is not None and bool(self.force.any())
+    remedy: str
 
     @property
     def said(self) -> str:
         """What acts on the rod in it."""
-        parts = [
-            f"{f:.3g} N at {1e3 * s:.4g} mm" for f, s in zip(self.force.norm(dim=-1).tolist(), self.location.tolist(), strict=True)
-        ]
+        pushes = zip(self.force.tolist(), self.location.tolist(), strict=True)
+        parts = [f"({x:.3g}, {y:.3g}) N at {1e3 * s:.4g} mm" for (x, y), s in pushes]
         if self.tip is not None:
             force, moment = (", ".join(f"{v:.3g}" for v in part.tolist()) for part in (self.tip[:3], self.tip[3:]))
             parts.append(f"a force of ({force}) N{f' and a moment of ({moment}) N m' * bool(self.tip[3:].any())} at the tip")
@@ -106,16 +105,16 @@ def other_solutions(
 ) -> tuple[tuple[Solution, ...], ...]:
     """For every sample of a fit the other equilibria that explain its readings too (their chi^2 is accepted), cheapest first.
 
-    Only of samples that are accepted and that were read at few places, or whose fit has a push beside an unknown force at the tip
-    (estimation.other_fits). parts: the unknowns of each sample, as in Analysis.
+    Only of samples that are accepted and that were read at few places, or for which estimation.elsewhere has others. parts: the
+    unknowns of each sample, as in Analysis.
     """
     settings = replace(settings or Settings(), restarts=(), basins=0, sized=False)
     found: list[tuple[Solution, ...]] = [()] * problem.batch
     few = read_at_few_places(problem)
     for unknowns, index in parts:
         own = problem.of(unknowns)
-        pushed = beside_the_tip(own)
-        asked = [index[fit.accepted[index] & few[index]], index[fit.accepted[index] & ~few[index] & pushed]]
+        several = elsewhere(own) is not None
+        asked = [index[fit.accepted[index] & few[index]], index[fit.accepted[index] & ~few[index] & several]]
         for rows in (chunk for wanted in asked if len(wanted) for chunk in wanted.split(CHUNK)):
             with one_thread(True):  # many small tensors, which several threads wait for longer than they work at
                 each = _others(own.take(rows), fit.x[rows, : own.size], settings, bool(few[rows[0]]))
@@ -125,7 +124,7 @@ def other_solutions(
 
 
 def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings, few: bool) -> list[tuple[Solution, ...]]:
-    """Of samples whose fits are x. few: read at few places, else pushed beside an unknown force at the tip."""
+    """Of samples whose fits are x. few: read at few places, else for which estimation.elsewhere has others."""
 
     def fitting(problem: Problem, start: Start) -> Estimate:
         return estimate_each(problem, settings, start)
@@ -136,11 +135,12 @@ def _others(problem: Problem, x: Float[Tensor, "B n"], settings: Settings, few: 
     if few:
         others = other_fits(problem, x, *_starts(problem), rods, SAME * problem.robot.rod.length, fitting)
     else:
-        others = pushes_elsewhere(problem, x, fitting)
+        others = fits_elsewhere(problem, x, fitting)
     found: list[list[Solution]] = [[] for _ in range(problem.batch)]
     if others is not None:
-        tried, of = others
+        to, (tried, of) = elsewhere(problem), others
+        remedy = MORE_SENSORS if to is None else to.remedy
         for c, b in enumerate(of.tolist()):
             tip = None if tried.tip is None else tried.tip[c]
-            found[b].append(Solution(float(tried.chi2[c]), tried.force[c], tried.location[c], tip))
+            found[b].append(Solution(float(tried.chi2[c]), tried.force[c], tried.location[c], tip, remedy))
     return [tuple(others) for others in found]

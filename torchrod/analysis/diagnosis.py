@@ -126,9 +126,7 @@ class Diagnosis:
         if self.others and (others := self.others[sample]):
             told = "; by ".join(f"{other.said} (chi2 = {other.chi2:.3g})" for other in others[:MOST_TOLD])
             more = f"; and by {len(others) - MOST_TOLD} more" if len(others) > MOST_TOLD else ""
-            pushed = any(other.push for other in others)
-            remedy = "measure the force at the tip, or what pushes" if pushed else "add sensors along the rod"
-            said.append(f"The readings are explained as well by {told}{more}; {remedy}.")
+            said.append(f"The readings are explained as well by {told}{more}; {others[0].remedy}.")
         if self.rivals and self.rivals[sample]:
             said.append(self.rivals[sample])
         return " ".join(said)

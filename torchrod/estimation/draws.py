@@ -32,8 +32,8 @@ from ..util.status import Status
 from ..util.threads import one_thread
 from . import filter as ekf
 from .chart import FAINT, Chart
+from .elsewhere import across_strip, elsewhere, fits_elsewhere
 from .evaluator import Evaluator, KernelEvaluator, SensorEvaluator, evaluator
-from .other_fits import beside_the_tip, place_and_tip, pushes_elsewhere
 from .pareto import GOOD, effective_size, smoothed
 from .result import Estimate
 from .solve import Settings, solver_of
@@ -51,7 +51,8 @@ SMALLER = (0.0, 0.5)  # of the way, in logarithms, from there to the fit's
 FARTHEST = 4.0  # |eta| of the proposal's centre
 MOST_OTHERS = 2  # fits of a sample
 HARDLY = 0.02  # of the draws: of a fit with fewer nobody is told whether its weights can be trusted
-ENOUGH = 0.1  # of the draws: a smaller effective size asks for another round
+ENOUGH = 0.1  # of the draws: a smaller effective size asks for another round,
+ON_STRIP = 0.25  # and on a strip: forces across it and along its soft side trade along a curve, of which one end may be missed
 PLENTY = 0.3  # with so many, a k-hat up to 1 will do
 ROUNDS = 3  # of matched proposals
 SURVIVE = 0.5  # of the draws, from one temperature to the next
@@ -337,7 +338,8 @@ def _importance(target: _Target, first: list[tuple["_Proposal | _OnGrid", int]],
     index, seen = torch.arange(len(target.x)), torch.cat([p.draw(k, i) for i, (p, k) in enumerate(first)], 1)
     log_pi, x = target(seen, index)
     found = _weighed(proposals, shares, seen, log_pi, x, Method.IMPORTANCE)
-    where = _poor(found, count).nonzero().squeeze(-1)
+    enough = count * (ENOUGH if across_strip(target.problem.robot.rod) is None else ON_STRIP)
+    where = _poor(found, enough).nonzero().squeeze(-1)
     proposals, seen, log_pi, x = _of(where, proposals, seen, log_pi, x)
     log_weight = found.log_weight[where]
     for turn in range(ROUNDS):
@@ -351,7 +353,7 @@ def _importance(target: _Target, first: list[tuple["_Proposal | _OnGrid", int]],
         log_pi, x = torch.cat([log_pi, log_fresh], 1), torch.cat([x, x_fresh], 1)
         again = _weighed(proposals, shares, seen, log_pi, x, Method.MATCHED)
         log_weight = again.log_weight
-        poor = _poor(again, count)
+        poor = _poor(again, enough)
         if turn == ROUNDS - 1:  # many draws that count, and the largest of them not too large: as good as tempered ones
             poor = poor & ~((again.k_hat < 1) & (again.ess > PLENTY * count))
         fine = (~poor | (turn == ROUNDS - 1)).nonzero().squeeze(-1)
@@ -371,8 +373,8 @@ def _of(rows: Int[Tensor, " c"], proposals: list["_Proposal | _OnGrid"], *tensor
     return [p.take(rows) for p in proposals], *(t[rows] for t in tensors)
 
 
-def _poor(found: _Found, count: int) -> Bool[Tensor, " b"]:
-    return ~(found.k_hat <= GOOD) | (found.ess < ENOUGH * count)
+def _poor(found: _Found, enough: float) -> Bool[Tensor, " b"]:
+    return ~(found.k_hat <= GOOD) | (found.ess < enough)
 
 
 def _weighed(
@@ -567,18 +569,19 @@ def _drawn(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"],
 
 
 def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int) -> _Found:
-    """The same about all fits of a push beside an unknown force at the tip, each by the evidence of what was drawn about it.
+    """The same about all fits of samples that have several (estimation.elsewhere), each by the evidence of what was drawn about it.
 
     The equilibria about one fit are no branch of those about another: what is drawn about the one hardly finds the other. Where
     it does, a fit has its draws twice; the evidence counts of each run what is nearest to its own fit.
     """
     found = _drawn(problem, x, C, nu, draws)
-    others = pushes_elsewhere(problem, x, solver_of(Settings(restarts=(), basins=0, sized=False)))
-    if others is None:
+    to = elsewhere(problem)
+    others = fits_elsewhere(problem, x, solver_of(Settings(restarts=(), basins=0, sized=False)))
+    if to is None or others is None:
         return found
     fit, of = others
     turn = torch.arange(len(of)) - torch.searchsorted(of, of)  # 0 for the cheapest of each sample
-    runs, centres = [found], [place_and_tip(problem, x)]
+    runs, centres = [found], [to.marks(problem, x)]
     for k in range(min(MOST_OTHERS, int(turn.max()) + 1)):
         rows = of[turn == k]
         own = fit.of((turn == k).nonzero().squeeze(-1), problem.size)
@@ -586,11 +589,11 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
         run.log_weight[:], run.log_evidence[:] = -math.inf, -math.inf  # of samples without another fit
         run.put(rows, _drawn(problem.take(rows), own.x, own.covariance, nu, draws))
         runs.append(run)
-        centres.append(torch.full_like(centres[0], torch.inf).index_copy(0, rows, place_and_tip(problem, own.x)))
+        centres.append(torch.full_like(centres[0], torch.inf).index_copy(0, rows, to.marks(problem, own.x)))
     evidence = torch.stack([run.log_evidence.nan_to_num(-math.inf) for run in runs], 1)
     log_weight = torch.cat([run.log_weight for run in runs], 1).unflatten(1, (len(runs), draws))
     many = torch.stack([run.x for run in runs], 1)
-    to = (place_and_tip(problem, many).unsqueeze(3) - torch.stack(centres, 1)[:, None, None]).norm(dim=-1).nan_to_num(torch.inf)
+    to = (to.marks(problem, many).unsqueeze(3) - torch.stack(centres, 1)[:, None, None]).norm(dim=-1).nan_to_num(torch.inf)
     at_home = to.argmin(-1) == torch.arange(len(runs)).unsqueeze(-1)
     share = torch.where(at_home, log_weight.exp(), 0.0).sum(-1)
     total = torch.where(torch.isfinite(evidence).sum(1) > 1, (evidence + share.log()).logsumexp(1), evidence[:, 0])
@@ -635,7 +638,7 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
             if not len(rows):
                 continue
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
-            drawn = _about_all_fits if beside_the_tip(part) else _drawn
+            drawn = _drawn if elsewhere(part) is None else _about_all_fits
             found = drawn(part, estimate.x[rows], estimate.covariance[rows], nu, draws)
             x[rows], weight[rows] = found.x, found.log_weight.exp()
             loads = len(Chart(part, found.x[:, 0], None).places)

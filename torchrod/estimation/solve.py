@@ -23,8 +23,8 @@ from ..util.status import Status
 from ..util.threads import one_thread
 from . import checks
 from . import filter as ekf
+from .elsewhere import cheapest
 from .evaluator import Evaluator, Run, evaluator
-from .other_fits import cheapest
 from .result import Estimate, limit, make_estimate
 from .starts import Fate, Origin, Start, StartRule, challenged_by_cold, cold_start, in_equilibrium
 from .tip_size import sized
