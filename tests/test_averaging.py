@@ -51,7 +51,7 @@ def test_probabilities_are_those_of_the_evidence():
 
 
 def test_a_resultant_holds_what_was_merged():
-    """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of the resultants of these."""
+    """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of the resultants of these, then 79."""
     problem, truth = posed(24, 2, (0.5, 2.0), gap=0.06 * L)
     found = analyze(problem, contact_hypotheses(problem), sampled=True)
     assert found.intervals is not None and found.evidence is not None and found.evidence.probability is not None
@@ -60,7 +60,7 @@ def test_a_resultant_holds_what_was_merged():
     inside = (size >= interval[:, 0]) & (size <= interval[:, 1])
     merged = found.evidence.choice < 2
     assert int(merged.sum()) >= 5
-    assert float(inside.double().mean()) > 0.85 and float(inside[merged].double().mean()) > 0.75
+    assert float(inside.double().mean()) > 0.85 and float(inside[merged].double().mean()) > 0.85
 
 
 def test_close_explanations_are_told(tmp_path, capsys):
@@ -92,7 +92,9 @@ def test_close_explanations_are_told(tmp_path, capsys):
 
 
 def test_a_band_of_any_form_holds_a_uniform_load():
-    """Over 30 or 60 % of the rod, of 100 point forces; a Gaussian's band holds a quarter of it."""
+    """Over 30 or 60 % of the rod, of 100 point forces; a Gaussian's band holds a quarter of it. Where it competes with Gaussians that
+    explain the readings alike, too: 64 % once.
+    """
     random, robot, B, M = torch.Generator().manual_seed(4), steel_rod(), 8, 100
     s = (torch.arange(M, dtype=DTYPE) + 0.5) / M
     first, length = 0.1 + 0.3 * torch.rand(B, 1, generator=random, dtype=DTYPE), T([0.3, 0.6]).repeat(B // 2).unsqueeze(-1)
@@ -102,7 +104,7 @@ def test_a_band_of_any_form_holds_a_uniform_load():
     p = p + 2e-4 * torch.randn(p.shape, generator=random, dtype=DTYPE)
     problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale)), [Markers(S, p, 2e-4)])
     held = {}
-    for prior in ("smooth", "distributed"):
+    for prior in ("smooth", "distributed", "auto"):
         found = analyze(problem, contact_hypotheses(problem, 1, prior), sampled=True)
         profile = found.profile
         assert profile is not None and found.estimate.accepted.all()
@@ -110,4 +112,4 @@ def test_a_band_of_any_form_holds_a_uniform_load():
         truth = ((at > first) & (at < first + length)).to(DTYPE) / length / L
         inside = (truth >= profile.band[..., 2, 0]) & (truth <= profile.band[..., 2, 1])
         held[prior] = float(inside[truth > 0].double().mean())
-    assert held["distributed"] < 0.6 < 0.9 < held["smooth"]
+    assert held["distributed"] < 0.6 < 0.9 < min(held["smooth"], held["auto"])

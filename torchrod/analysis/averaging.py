@@ -1,9 +1,10 @@
 """What is known whatever the hypothesis: their probabilities, and resultants and bands averaged by them.
 
 The marginal likelihood of a hypothesis is the mean weight of the draws of its posterior (estimation.draws), with priors that are
-normalized. Probabilities p_h are in its proportion, times ONE_MORE for each load. Loads are reported of the likeliest one, of a
-smooth load where no other explains the readings; the resultant, and f(s) along the rod, which all of them have, of draws of all of
-them, each weighted by p_h. Source: Hoeting et al., Statistical Science 14 (1999) 382.
+normalized. Probabilities p_h, by which loads are reported, are in its proportion, times ONE_MORE for each load; a smooth load is
+reported where no other explains the readings. The resultant, and f(s) along the rod, which all of them have, are of draws of all of
+them, weighted with HIDDEN for each load: one that is not reported may be there, and must not be left out of an interval.
+Source: Hoeting et al., Statistical Science 14 (1999) 382.
 """
 
 import math
@@ -24,7 +25,10 @@ from ..util.precision import DTYPE
 from .count import Bar, Evidence, Hypothesis, Selection, no_bar
 
 ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
+HIDDEN = 0.5  # the same where that does not matter, for what is averaged
 OF_ANY_FORM = 0.0  # loads that a smooth one counts as: there are more forms of a distributed load than one
+POSSIBLE = 0.05  # of the probability: a form of the loads that is not left out
+ANY_FORM = "smooth"
 RUNNING = 12.0  # of BIC: a hypothesis that is behind by more is out, by e^-6
 NEGLIGIBLE = 0.005  # of the probability: all other hypotheses together
 TRUSTED = 1.0  # of k-hat: draws whose weights are worse tell no evidence
@@ -68,6 +72,8 @@ def average(
         for h, c, own in zip(held.tolist(), candidates, problems, strict=True)
     ]
     rarer = math.log(ONE_MORE) * torch.tensor(more)
+    hidden = math.log(HIDDEN) * torch.tensor([0 if h else c.contacts for h, c in zip(held.tolist(), candidates, strict=True)])
+    forms = [_form(c) for c in candidates]
     fit, choice = found.fit, found.evidence.choice.clone()
     collected = Collected(fit)
     with bar(problem.batch, "draws") as shown:
@@ -84,10 +90,16 @@ def average(
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
                     collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen)))
-            _mix(collected, chunk, drawn, probability[chunk])
+            _mix(collected, chunk, drawn, _probabilities(drawn, scores[chunk], hidden), forms)
             shown.update(len(chunk))
     evidence = replace(found.evidence, choice=choice, probability=probability)
     return Averaged(fit, evidence, collected.whole(fit))
+
+
+def _form(candidate: Hypothesis) -> str:
+    """What kind of load a hypothesis has; "" for none."""
+    loads = candidate.unknowns.loads
+    return getattr(loads, "prior_name", "").partition("(")[0] if loads.size else ""
 
 
 def _running(scores: Float[Tensor, "B H"], kind: Bool[Tensor, " H"]) -> Bool[Tensor, "B H"]:
@@ -114,15 +126,15 @@ def _drawn(
     return drawn
 
 
-def _probabilities(drawn: list[_Drawn], scores: Float[Tensor, "c H"], rarer: Float[Tensor, " H"]) -> Float[Tensor, "c H"]:
-    """By the evidence, each further load being rarer; of a sample with draws that are not to be trusted by the BIC."""
+def _probabilities(drawn: list[_Drawn], scores: Float[Tensor, "c H"], before: Float[Tensor, " H"]) -> Float[Tensor, "c H"]:
+    """By the evidence and what hypotheses are worth before it, in logarithms; by the BIC where draws are not to be trusted."""
     log_evidence = torch.full_like(scores, -torch.inf)
     for d in drawn:
         sound = (d.draws.k_hat <= TRUSTED) & torch.isfinite(d.draws.log_evidence)
         log_evidence[d.rows, d.h] = torch.where(sound, d.draws.log_evidence, torch.nan)
     doubtful = log_evidence.isnan().any(-1, keepdim=True)
     by_bic = torch.where(log_evidence == -torch.inf, -torch.inf, -0.5 * scores.nan_to_num(torch.inf, torch.inf))
-    return torch.softmax(torch.where(doubtful, by_bic, log_evidence + rarer), -1)
+    return torch.softmax(torch.where(doubtful, by_bic, log_evidence + before), -1)
 
 
 def _likeliest(
@@ -139,18 +151,60 @@ def _likeliest(
     return torch.where(aside, -1.0, probability).argmax(-1)
 
 
-def _mix(collected: Collected, chunk: Int[Tensor, " c"], drawn: list[_Drawn], probability: Float[Tensor, "c H"]) -> None:
-    """Resultants and bands of draws of all hypotheses, of the samples that have several."""
+def _mix(
+    collected: Collected,
+    chunk: Int[Tensor, " c"],
+    drawn: list[_Drawn],
+    probability: Float[Tensor, "c H"],
+    forms: Sequence[str],
+) -> None:
+    """Resultants and bands of draws of all hypotheses, of the samples that have several.
+
+    Of loads of several forms these hold what each form has for itself, where it has a share of POSSIBLE or, any form, explains a
+    sample at all: readings that several forms explain alike say nothing of which it is, while the marginal likelihood takes the one
+    with the fewest numbers.
+    """
     several = (probability.amax(-1) < 1 - NEGLIGIBLE).nonzero().squeeze(-1)
-    band, whole = collected.values["band"], collected.values["resultant"]
-    if not len(several) or whole is None:
+    _put(collected, chunk, several, _mixed(drawn, probability, several), hull=False)
+    kinds = sorted({form for form in forms if form})
+    for kind in kinds if kinds[1:] else []:
+        mine = torch.tensor([form == kind for form in forms])
+        of_kind = [d for d in drawn if mine[d.h]]
+        possible = torch.where(mine, probability, 0.0).sum(-1) > POSSIBLE
+        for d in of_kind if kind == ANY_FORM else []:
+            possible[d.rows] |= d.fit.accepted
+        rows = possible.nonzero().squeeze(-1)
+        _put(collected, chunk, rows, _mixed(of_kind, torch.where(mine, probability, 0.0), rows), hull=True)
+
+
+def _put(
+    collected: Collected, chunk: Int[Tensor, " c"], rows: Int[Tensor, " r"], mixed: tuple[Tensor, Tensor | None] | None, hull: bool
+) -> None:
+    """Instead of the intervals of rows of a chunk; or, hull, beside them."""
+    if mixed is None:
         return
+    at = chunk[rows]
+    for name, new in zip(("resultant", "band"), mixed, strict=True):
+        values = collected.values[name]
+        if new is None or values is None:
+            continue
+        old = values[at]
+        whole = torch.stack([torch.fmin(new[..., 0], old[..., 0]), torch.fmax(new[..., 1], old[..., 1])], -1)
+        values[at] = torch.where(torch.isfinite(new), whole if hull else new, old)
+
+
+def _mixed(
+    drawn: list[_Drawn], probability: Float[Tensor, "c H"], rows: Int[Tensor, " r"]
+) -> tuple[Float[Tensor, "r 4 2"], Float[Tensor, "r S 3 2"] | None] | None:
+    """95 % intervals of the resultant, and the band, of draws of several hypotheses; NaN without any; None of no rows."""
+    if not len(rows):
+        return None
     values, weights, profiles = [], [], []
     for d in drawn:
-        own = torch.full((len(chunk),), -1).index_copy(0, d.rows, torch.arange(len(d.rows)))[several]
-        there, rows = own >= 0, own.clamp(min=0)
-        x, weight = d.draws.x[rows], d.draws.weight[rows].nan_to_num(0.0)
-        weight = torch.where(there.unsqueeze(-1), weight * probability[several, d.h].unsqueeze(-1), 0.0)
+        own = torch.full((len(probability),), -1).index_copy(0, d.rows, torch.arange(len(d.rows)))[rows]
+        there, some = own >= 0, own.clamp(min=0)
+        x, weight = d.draws.x[some], d.draws.weight[some].nan_to_num(0.0)
+        weight = torch.where(there.unsqueeze(-1), weight * probability[rows, d.h].unsqueeze(-1), 0.0)
         R = resultant(d.draws.problem, x).nan_to_num(0.0)
         values.append(torch.cat([R, R.norm(dim=-1, keepdim=True)], -1))
         weights.append(weight)
@@ -159,12 +213,17 @@ def _mix(collected: Collected, chunk: Int[Tensor, " c"], drawn: list[_Drawn], pr
         s = torch.linspace(0.0, d.draws.problem.robot.rod.length, NODES, dtype=DTYPE)
         profiles.append((densities(family, gamma, s), weight.sum(-1, keepdim=True) / OF_BAND))
     total = torch.cat(weights, 1)
-    sound = (total.sum(-1) > 0)[:, None, None]
-    at = chunk[several]
-    whole[at] = torch.where(sound, quantiles(torch.cat(values, 1), total / total.sum(-1, keepdim=True)), whole[at])
-    if band is None or any(f is None for f, _ in profiles):
-        return
+    total = total / total.sum(-1, keepdim=True)  # NaN of a sample without draws
+    whole = _or_nan(quantiles(torch.cat(values, 1), total.nan_to_num(1.0)), total)
+    if any(f is None for f, _ in profiles):
+        return whole, None
     f = torch.cat([f for f, _ in profiles if f is not None], -1).double().flatten(1, 2)
     share = torch.cat([w.expand(-1, OF_BAND) for _, w in profiles], -1)
-    mixed = quantiles(f.transpose(1, 2), share / share.sum(-1, keepdim=True)).unflatten(1, (3, NODES)).transpose(1, 2)
-    band[at] = torch.where(sound.unsqueeze(-1), mixed, band[at])
+    share = share / share.sum(-1, keepdim=True)
+    mixed = quantiles(f.transpose(1, 2), share.nan_to_num(1.0)).unflatten(1, (3, NODES)).transpose(1, 2)
+    return whole, _or_nan(mixed, total)
+
+
+def _or_nan(values: Float[Tensor, "r ..."], weight: Float[Tensor, "r D"]) -> Float[Tensor, "r ..."]:
+    known = torch.isfinite(weight).all(-1).view(-1, *[1] * (values.ndim - 1))
+    return torch.where(known, values, torch.nan)

@@ -174,13 +174,16 @@ def selection(
     settings: Settings | None = None,
     start: StartFor = always_cold,
     bar: Bar = no_bar,
+    thorough: bool = False,
 ) -> Selection:
     """Fit the hypotheses stage by stage, the fewest contacts first, and keep, per sample, the one of least BIC.
 
     problem: robot and readings; its unknowns are replaced by each candidate's. Loads that the chosen hypothesis does not have are
     NaN. start: the rule a hypothesis starts by where the residual of an earlier fit suggests nothing. A sample for which nothing
     converges is reported with the fit that left the smallest chi^2. One with too few markers for any load is invalid: it would show
-    none. Errors: ValueError where that is so of the whole problem.
+    none. thorough: a second load, a third and so on is tried on every sample that has the one before, for analysis.averaging: one
+    that hardly shows is not chosen, but moves the others and their resultant. Errors: ValueError where that is so of the whole
+    problem.
     """
     settings = settings or Settings()
     problem = _that_show_a_load(problem, candidates)
@@ -197,7 +200,7 @@ def selection(
         if hypothesis.spare and chosen is not None:
             index, begin = _wanting(hypothesis, candidates, chosen), start(own)
         else:
-            index, begin = _needed(h, candidates, problems, fits, start(own), foreseen[:, h])
+            index, begin = _needed(h, candidates, problems, fits, start(own), foreseen[:, h], thorough)
         if not len(index):
             continue
         part = own.take(index)
@@ -308,6 +311,7 @@ def _needed(
     fits: dict[int, tuple[Estimate, Int[Tensor, " b"]]],
     rule: StartRule,
     foreseen: Float[Tensor, " B"],
+    thorough: bool,
 ) -> tuple[Int[Tensor, " b"], StartRule | Start]:
     """The samples that hypothesis h is to be fitted to, and from where: the fit of the same kind with one contact less, if any.
 
@@ -326,7 +330,8 @@ def _needed(
     per_load = free_parameters(own) - free_parameters(before)
     asked = per_load * torch.log(before.seen.to(fitted.cost.dtype).clamp(min=math.e))
     foreseen[index] = bic(before, fitted) - found.drop + asked
-    rows = (sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)).nonzero().squeeze(-1)
+    promising = (found.drop > PROMISING * asked) | (thorough and contacts > 1)
+    rows = (sound & (promising | ~fitted.accepted)).nonzero().squeeze(-1)
     return index[rows], start_with_one_more(own.unknowns, found.take(rows)) if contacts > 1 else rule
 
 

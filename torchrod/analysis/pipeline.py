@@ -161,9 +161,10 @@ def analyze(
         nonlocal evidence, drawn
         own = [replace(c, unknowns=replace(c.unknowns, registration=problem.unknowns.registration)) for c in competing]
         if len(own) > 1:
-            chosen = selection(problem, own, settings, start, bar)
+            drawing = sampled and not shared
+            chosen = selection(problem, own, settings, start, bar, thorough=drawing)
             found, evidence = chosen.fit, chosen.evidence
-            if sampled and not shared:
+            if drawing:
                 averaged = average(problem, own, chosen, settings.robust, bar)
                 found, evidence, drawn = averaged.fit, averaged.evidence, averaged.intervals
             return found, parts_of(own, evidence)
