@@ -1,4 +1,4 @@
-"""How often 95 % intervals hold the truth: python scripts/coverage.py [--cases N] [--kinds K ..] [--out DIR].
+"""How often 95 % intervals hold the truth: python scripts/coverage.py [--cases N] [--kinds K ..] [--forms N] [--out DIR].
 
 It writes DIR/coverage.md. Each kind has the right model and random members. Shapes are of torchrod.solve_shape with point forces or
 dead tip wrenches on four times the steps of the fit: another discretization and another load than the Gaussians that are fitted.
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from studies import bands
 from studies.reproduction.cases import steel_rod
 from torch import Tensor
 
@@ -142,6 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=500, help="of each kind")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--forms", type=int, default=100, help="loads of each form for the bands of f(s); 0 for none")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)  # before the work that would be lost
@@ -150,6 +152,8 @@ def main() -> None:
     for name in options.kinds:
         lines.append(row(KINDS[name], options.cases))
         say(lines[-1])
+    if options.forms:
+        lines += bands.table(options.forms)
     (options.out / "coverage.md").write_text("\n".join(lines) + "\n")
 
 

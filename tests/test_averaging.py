@@ -51,7 +51,7 @@ def test_probabilities_are_those_of_the_evidence():
 
 
 def test_a_resultant_holds_what_was_merged():
-    """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of the resultants of these, then 79."""
+    """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of their resultants, then 79."""
     problem, truth = posed(24, 2, (0.5, 2.0), gap=0.06 * L)
     found = analyze(problem, contact_hypotheses(problem), sampled=True)
     assert found.intervals is not None and found.evidence is not None and found.evidence.probability is not None
@@ -92,8 +92,9 @@ def test_close_explanations_are_told(tmp_path, capsys):
 
 
 def test_a_band_of_any_form_holds_a_uniform_load():
-    """Over 30 or 60 % of the rod, of 100 point forces; a Gaussian's band holds a quarter of it. Where it competes with Gaussians that
-    explain the readings alike, too: 64 % once.
+    """Over 30 or 60 % of the rod, of 100 point forces; a Gaussian's band holds a quarter of it.
+
+    Where it competes with Gaussians that explain the readings alike, too: 64 % once.
     """
     random, robot, B, M = torch.Generator().manual_seed(4), steel_rod(), 8, 100
     s = (torch.arange(M, dtype=DTYPE) + 0.5) / M

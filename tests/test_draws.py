@@ -10,6 +10,7 @@ from tests.problems import posed, unknowns_of
 from tests.robots import T, busy_robot, steel_rod
 from torchrod.estimation.chart import Chart
 from torchrod.estimation.draws import Method
+from torchrod.estimation.intervals import of_sizes, quantiles
 from torchrod.estimation.pareto import effective_size, smoothed
 from torchrod.model.problem import TIP_ROWS
 
@@ -112,3 +113,22 @@ def test_evidence_and_intervals_where_the_number_of_pushes_is_chosen():
     assert torch.isfinite(found.intervals.magnitude[..., 0]).sum(-1).tolist() == [0, 1, 2]
     assert bool(torch.isfinite(found.intervals.resultant).all())
     assert float(found.intervals.resultant[0].abs().max()) < 1e-2
+
+
+def test_the_size_of_what_may_be_nothing_may_be_nothing():
+    """Of draws about a vector that is measured: held in 95 % for zero, too, whose size quantiles of |v| never hold; and no wider
+    where the vector is told from zero.
+    """
+    random, sigma = torch.Generator().manual_seed(5), torch.tensor([0.3, 0.2, 0.02])
+    weight = torch.full((200, 512), 1 / 512)
+    for truth in ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.5, 0.1, 0.0], [2.0, 1.0, 0.3]):
+        v = torch.tensor(truth)
+        seen = v + sigma * torch.randn(200, 1, 3, generator=random)
+        draws = (seen + sigma * torch.randn(200, 512, 3, generator=random)).unsqueeze(2)
+        interval, plain = of_sizes(draws, weight)[:, 0], quantiles(draws.norm(dim=-1), weight)[:, 0]
+        held = ((interval[:, 0] <= v.norm()) & (v.norm() <= interval[:, 1])).double().mean()
+        assert held > 0.9, truth
+        if truth[0] == 0:
+            assert ((plain[:, 0] <= v.norm()) & (v.norm() <= plain[:, 1])).double().mean() < 0.8
+        if truth[0] > 1:
+            assert torch.equal(interval, plain)

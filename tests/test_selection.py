@@ -117,7 +117,7 @@ def test_a_wide_load_is_told_from_a_contact(tmp_path):
 def test_a_contact_and_a_push_at_the_tip_are_told_from_two_contacts_and_a_push(tmp_path):
     """Pushes along the rod beyond its buckling load: the stages alone end at "2 + tip force" in these (docs/contacts.md)."""
     truth = contacts.Truth(1, tip=True)
-    markers = contacts.cases(truth, 20, 24, 5003, 2e-4)
+    markers, _ = contacts.cases(truth, 20, 24, 5003, 2e-4)
     results = run(tmp_path, markers, "--contacts", "auto", "--unknown-tip", "force", "--noise", "2e-4")
     right = [sample["evidence"]["chosen"] == "1 + tip force" for sample in results]
     assert sum(right) >= 20

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..estimation.draws import Draws, picked, posterior_draws, systematic
-from ..estimation.intervals import CHUNK, Collected, Intervals, intervals, quantiles, resultant
+from ..estimation.intervals import CHUNK, Collected, Intervals, intervals, of_sizes, quantiles, resultant
 from ..estimation.load_profile import DRAWS as OF_BAND
 from ..estimation.load_profile import NODES, densities
 from ..estimation.result import Estimate
@@ -205,8 +205,7 @@ def _mixed(
         there, some = own >= 0, own.clamp(min=0)
         x, weight = d.draws.x[some], d.draws.weight[some].nan_to_num(0.0)
         weight = torch.where(there.unsqueeze(-1), weight * probability[rows, d.h].unsqueeze(-1), 0.0)
-        R = resultant(d.draws.problem, x).nan_to_num(0.0)
-        values.append(torch.cat([R, R.norm(dim=-1, keepdim=True)], -1))
+        values.append(resultant(d.draws.problem, x).nan_to_num(0.0))
         weights.append(weight)
         state, family = d.draws.problem.state, d.draws.problem.unknowns.loads
         gamma = picked(x[..., state.loads.at].nan_to_num(0.0), systematic(weight + 1e-300, OF_BAND))
@@ -214,7 +213,8 @@ def _mixed(
         profiles.append((densities(family, gamma, s), weight.sum(-1, keepdim=True) / OF_BAND))
     total = torch.cat(weights, 1)
     total = total / total.sum(-1, keepdim=True)  # NaN of a sample without draws
-    whole = _or_nan(quantiles(torch.cat(values, 1), total.nan_to_num(1.0)), total)
+    R, weight = torch.cat(values, 1), total.nan_to_num(1.0)
+    whole = _or_nan(torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight)], 1), total)
     if any(f is None for f, _ in profiles):
         return whole, None
     f = torch.cat([f for f, _ in profiles if f is not None], -1).double().flatten(1, 2)

@@ -18,6 +18,7 @@ from .load_profile import LEVELS, NODES, band_of_draws
 from .result import Z95, Estimate
 
 FLAT = 0.3  # times EI: how stiff the soft side of a flat rod is at most
+ALL_THREE = (0.0085, 0.9915)  # between which three numbers are in 95 % of cases
 NEXT_TO_NONE = 1e-3  # of the draws: below it lies what stands for the least
 CHUNK = 64  # samples at a time: their draws are not kept
 
@@ -62,16 +63,24 @@ def quantiles(
     return torch.cat(found, -1)
 
 
-def of_sizes(values: Float[Tensor, "B D k"], weight: Float[Tensor, "B D"], flat: bool) -> Float[Tensor, "B k 2"]:
-    """Intervals of sizes; on a flat rod from the least draw up, where that is shorter than between the quantiles of LEVELS.
+def of_sizes(vectors: Float[Tensor, "B D k d"], weight: Float[Tensor, "B D"], flat: bool = False) -> Float[Tensor, "B k 2"]:
+    """Intervals of the sizes of vectors: between the quantiles of LEVELS.
 
-    There a force's component along the stiff side hardly shows, and its likeliest size is the least one.
+    The size of what is only known to be small is never small in the draws: where two components or more are not told from zero, the
+    interval begins at the least size that all components allow. On a flat rod it begins at the least draw where that is shorter: a
+    force's component along the stiff side hardly shows there, and its likeliest size is the least one.
     """
-    if not flat:
-        return quantiles(values, weight)
-    both, below = quantiles(values, weight), quantiles(values, weight, (NEXT_TO_NONE, LEVELS[1] - LEVELS[0]))
-    shorter = below[..., 1] - below[..., 0] < both[..., 1] - both[..., 0]
-    return torch.where(shorter.unsqueeze(-1), below, both)
+    sizes = vectors.norm(dim=-1)
+    found = quantiles(sizes, weight)
+    if flat:
+        below = quantiles(sizes, weight, (NEXT_TO_NONE, LEVELS[1] - LEVELS[0]))
+        shorter = below[..., 1] - below[..., 0] < found[..., 1] - found[..., 0]
+        found = torch.where(shorter.unsqueeze(-1), below, found)
+    each = quantiles(vectors.flatten(-2), weight, ALL_THREE).unflatten(1, vectors.shape[-2:])
+    least = torch.where(each[..., 0] > 0, each[..., 0], each[..., 1].clamp(max=0.0))  # nearest to zero in each interval
+    low, high = found.unbind(-1)
+    unsure = (least == 0).sum(-1) >= 2
+    return torch.stack([torch.where(unsure, low.minimum(least.norm(dim=-1)), low), high], -1)
 
 
 def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:
@@ -93,8 +102,9 @@ def intervals(draws: Draws) -> Intervals:
     parts = quantiles(torch.cat(values, -1), weight).split([v.shape[-1] for v in values], 1)
     place, force, whole, axial, tip, K = *parts[:4], parts[-1], report.location.shape[-1]
     flat = min(problem.robot.rod.sides) < FLAT
-    sizes = of_sizes(torch.cat([report.force.norm(dim=-1), R.norm(dim=-1, keepdim=True)], -1), weight, flat)
-    size, whole = sizes[:, :K], torch.cat([whole, sizes[:, K:]], 1)
+    force = force.unflatten(1, (K, 2))
+    size = of_sizes(report.force, weight, flat)
+    whole = torch.cat([whole, of_sizes(R.unsqueeze(2), weight, flat)], 1)
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
     band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
     numbers = draws.k_hat, draws.ess, draws.method
@@ -102,7 +112,7 @@ def intervals(draws: Draws) -> Intervals:
     if not isinstance(family, GaussianCoordinates | PointCoordinates | PaperCoordinates) and K:
         # The centroid of |f|, and the size of the net force, of draws that are not smooth are not those of their mean.
         size, place = torch.full_like(size, torch.nan), torch.full_like(place, torch.nan)
-    made = Intervals(size, place, force.unflatten(1, (K, 2)), drag, whole, tip if state.tip.size else None, band, *numbers)
+    made = Intervals(size, place, force, drag, whole, tip if state.tip.size else None, band, *numbers)
     return _masked(made, draws.k_hat <= 1)
 
 

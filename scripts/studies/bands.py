@@ -1,0 +1,134 @@
+"""How often the band of f(s) holds a load of any form, and the interval its resultant, where forms compete (--load-prior auto)."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+import torchrod as tr
+from studies.reproduction.cases import steel_rod
+
+PIECES, STEPS, MARKERS = 400, 40, 20  # point forces that a load is made of: steps end at each
+NOISES = 1e-3, 2.5e-3  # of the length
+LEAST = 0.1  # of the peak: where f(s) counts
+SIZE = 0.5, 1.5  # of the resultant, force scales; of loads that change sign, of their mean size
+
+Form = Callable[[Tensor, torch.Generator, int], Tensor]
+
+
+def _uniform(generator: torch.Generator, low: float, high: float, B: int) -> Tensor:
+    return low + (high - low) * torch.rand(B, 1, generator=generator, dtype=torch.float64)
+
+
+def even(length: float) -> Form:
+    """Over a part of the rod, somewhere from a tenth of it on."""
+
+    def form(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
+        first = _uniform(generator, 0.1, 1 - length, B)
+        return ((t > first) & (t < first + length)) / length
+
+    return form
+
+
+def ramp(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
+    """From nothing at the base to most at the tip."""
+    return (2 * t).expand(B, -1)
+
+
+def half_sine(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
+    """Over the whole rod."""
+    return (math.pi / 2 * torch.sin(math.pi * t)).expand(B, -1)
+
+
+def sine(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
+    """A whole wave, of any phase."""
+    return 2 * torch.sin(2 * math.pi * t + _uniform(generator, 0, 2 * math.pi, B))
+
+
+def contact(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
+    """A Gaussian of 1 to 3 % of the length, at 30 to 95 %."""
+    place, width = _uniform(generator, 0.3, 0.95, B), _uniform(generator, 0.01, 0.03, B)
+    return torch.exp(-0.5 * ((t - place) / width) ** 2) / (math.sqrt(2 * math.pi) * width)
+
+
+FORMS: dict[str, Form] = {
+    "uniform over 30 % of the rod": even(0.3),
+    "uniform over 60 %": even(0.6),
+    "ramp": ramp,
+    "half sine": half_sine,
+    "sine": sine,
+    "contact": contact,
+}
+
+
+@dataclass(frozen=True)
+class Held:
+    """Shares: of places where the band holds |f|, of samples whose resultant is held. width: of the band over the peak, median."""
+
+    band: float
+    resultant: float
+    width: float
+    cpu: float
+
+
+def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) -> Held:
+    """Of so many loads."""
+    robot, generator = steel_rod(), torch.Generator().manual_seed(seed)
+    rod = robot.rod
+    L, size, turn = rod.length, rod.force_scale * _uniform(generator, *SIZE, cases), _uniform(generator, 0, 2 * math.pi, cases)
+    state = generator.get_state()
+
+    def density(t: Tensor) -> Tensor:
+        """(B, T, 2) N/m at s / L."""
+        generator.set_state(state)
+        return (size * form(t, generator, cases) / L).unsqueeze(-1) * torch.stack([turn.cos(), turn.sin()], -1)
+
+    t = (torch.arange(PIECES, dtype=torch.float64) + 0.5) / PIECES
+    forces = torch.nn.functional.pad(density(t) * L / PIECES, (0, 1))
+    s = torch.linspace(L / MARKERS, L, MARKERS, dtype=torch.float64)
+    shape = tr.solve_shape(robot, (tr.PointForces(forces, (L * t).expand(cases, -1)),), None, s, cases, STEPS)
+    p = shape.p + noise * L * torch.randn(shape.p.shape, generator=generator, dtype=torch.float64)
+    unknowns = tr.Unknowns(tr.GaussianCoordinates(1, L, rod.force_scale))
+    problem = tr.Problem(robot, unknowns, [tr.Markers(s, p, noise * L)])
+    begun = time.process_time()
+    found = tr.analyze(problem, tr.contact_hypotheses(problem, "auto" if prior == "auto" else 1, prior), sampled=True)
+    cpu = time.process_time() - begun
+    assert found.profile is not None and found.intervals is not None
+    f, (low, high) = density(found.profile.s / L).norm(dim=-1), found.profile.band[..., 2, :].unbind(-1)
+    peak = f.amax(-1, keepdim=True)
+    whole, interval = shape.base_wrench[:, :3].norm(dim=-1), found.intervals.resultant[:, 3]
+    inside = (low <= f) & (f <= high)
+    return Held(
+        float(inside[f > LEAST * peak].double().mean()),
+        float(((interval[:, 0] <= whole) & (whole <= interval[:, 1])).double().mean()),
+        float(((high - low).mean(-1) / peak.squeeze(-1)).median()),
+        cpu / cases,
+    )
+
+
+def table(cases: int) -> list[str]:
+    """The section of a page."""
+    lines = [
+        "",
+        "## Loads of any form",
+        "",
+        f"{cases} loads a row, each made of {PIECES} point forces: with `--contacts auto --load-prior auto`, which does not know",
+        "their form, and with `--load-prior smooth`. Band: share (%) of the places where |f| is above a tenth of its peak at which",
+        "the 95 % band holds it; its mean width over the peak, median. Resultant: share of samples whose 95 % interval holds",
+        "|resultant|.",
+        "",
+        "| load | noise (of L) | auto: band | width | resultant | CPU (s) | smooth: band | width | resultant | CPU (s) |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, form in FORMS.items():
+        for noise in NOISES:
+            cells = []
+            for prior in ("auto", "smooth"):
+                held = measured(form, noise, prior, cases)
+                cells += [f"{100 * held.band:.1f}", f"{held.width:.2f}", f"{100 * held.resultant:.1f}", f"{held.cpu:.2f}"]
+            lines.append(f"| {name} | {100 * noise:g} % | {' | '.join(cells)} |")
+            print(lines[-1], flush=True)
+    return lines
