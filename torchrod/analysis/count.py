@@ -181,9 +181,8 @@ def selection(
     problem: robot and readings; its unknowns are replaced by each candidate's. Loads that the chosen hypothesis does not have are
     NaN. start: the rule a hypothesis starts by where the residual of an earlier fit suggests nothing. A sample for which nothing
     converges is reported with the fit that left the smallest chi^2. One with too few markers for any load is invalid: it would show
-    none. thorough: a second load, a third and so on is tried on every sample that has the one before, for analysis.averaging: one
-    that hardly shows is not chosen, but moves the others and their resultant. Errors: ValueError where that is so of the whole
-    problem.
+    none. thorough: one more load than a sample asks for is tried, if it has one, for analysis.averaging: what hardly shows is not
+    chosen, but moves the others and their resultant. Errors: ValueError where that is so of the whole problem.
     """
     settings = settings or Settings()
     problem = _that_show_a_load(problem, candidates)
@@ -194,13 +193,14 @@ def selection(
     nothing = torch.full((B, H), torch.nan, dtype=torch.float64)
     scores, foreseen = nothing, nothing.clone()
     fits: dict[int, tuple[Estimate, Int[Tensor, " b"]]] = {}
+    unasked = torch.full((B, H), not thorough)
     for h, (hypothesis, own) in enumerate(zip(candidates, problems, strict=True)):
         if chosen is not None and not own.determined:
             continue
         if hypothesis.spare and chosen is not None:
             index, begin = _wanting(hypothesis, candidates, chosen), start(own)
         else:
-            index, begin = _needed(h, candidates, problems, fits, start(own), foreseen[:, h], thorough)
+            index, begin = _needed(h, candidates, problems, fits, start(own), foreseen[:, h], unasked)
         if not len(index):
             continue
         part = own.take(index)
@@ -311,11 +311,12 @@ def _needed(
     fits: dict[int, tuple[Estimate, Int[Tensor, " b"]]],
     rule: StartRule,
     foreseen: Float[Tensor, " B"],
-    thorough: bool,
+    unasked: Bool[Tensor, "B H"],
 ) -> tuple[Int[Tensor, " b"], StartRule | Start]:
     """The samples that hypothesis h is to be fitted to, and from where: the fit of the same kind with one contact less, if any.
 
-    foreseen: takes the BIC that its score test promises.
+    foreseen: takes the BIC that its score test promises. unasked: which hypotheses a sample did not ask for, and from which no
+    further one is tried unless the sample asks for that.
     """
     own, contacts, everyone = problems[h], candidates[h].contacts, torch.arange(problems[h].batch)
     kin = [i for i, c in enumerate(candidates) if c.contacts == contacts - 1 and same_kind(c.unknowns, own.unknowns)]
@@ -330,8 +331,10 @@ def _needed(
     per_load = free_parameters(own) - free_parameters(before)
     asked = per_load * torch.log(before.seen.to(fitted.cost.dtype).clamp(min=math.e))
     foreseen[index] = bic(before, fitted) - found.drop + asked
-    promising = (found.drop > PROMISING * asked) | (thorough and contacts > 1)
-    rows = (sound & (promising | ~fitted.accepted)).nonzero().squeeze(-1)
+    needed = sound & ((found.drop > PROMISING * asked) | ~fitted.accepted)
+    wanted = needed | (sound & ~unasked[index, kin[0]] & (contacts > 1))
+    unasked[index, h] |= ~needed
+    rows = wanted.nonzero().squeeze(-1)
     return index[rows], start_with_one_more(own.unknowns, found.take(rows)) if contacts > 1 else rule
 
 
