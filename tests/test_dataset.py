@@ -27,7 +27,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.data import workers as production
+from torchrod.data import workers
 from torchrod.data.dataset import ARRAYS, digest, drawn_load
 from torchrod.data.shards import write_manifest, write_shard
 
@@ -140,7 +140,7 @@ def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, made):
 
 def test_a_cluster_that_is_not_there(tmp_path, made, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install torchrod[scale]")
-    monkeypatch.setattr(production, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 1)
     assert (
         main(["simulate-dataset", str(tmp_path / "d.toml"), "--out", str(tmp_path / "d"), "--scheduler", "tcp://127.0.0.1:9"]) == 2
     )
