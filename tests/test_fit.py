@@ -339,7 +339,7 @@ def fits(problem: Problem, settings: Settings | None = None):
 
 @pytest.mark.parametrize(
     "kind",
-    ["two contacts", *(pytest.param(k, marks=pytest.mark.study) for k in ("registration", "one contact", "tendons", "points"))],
+    ["one contact", *(pytest.param(k, marks=pytest.mark.study) for k in ("registration", "two contacts", "tendons", "points"))],
 )
 def test_whole_fits_agree_with_the_torch_path(kind, monkeypatch):
     """Loads to 1e-8 relative, status and iterations the same."""
