@@ -229,7 +229,7 @@ def test_places_off_the_rod():
         (lambda: GaussianCoordinates(2, 0.4, 1.0, locations=(0.1,)), "locations has 1 places for 2 loads; give one for each"),
         (lambda: PointCoordinates(1, 0.4, 1.0, (0.5,)), "must lie on the rod, 0 to 0.4 m"),
         (lambda: GaussianCoordinates(-1, 0.4, 1.0), "-1 loads; give 0 or more"),
-        (lambda: FourierCoordinates(3, 0.4, 0.0), r"force_scale is 0.0; it must be positive"),
+        (lambda: FourierCoordinates(3, 0.4, -1.0), r"force_scale is -1.0 N; it must be finite and not negative"),
         (lambda: GaussianCoordinates(1, float("nan"), 1.0), "length is nan; it must be positive"),
     ],
 )

@@ -355,7 +355,7 @@ def test_what_is_no_rod_ends_soon(tmp_path, capsys, monkeypatch):
 
 def test_a_rod_that_was_lost_is_found_again():
     """In no more than twice the frames that it was away for."""
-    t, g, away = take(70), np.random.default_rng(0), 25
+    t, g, away = take(45), np.random.default_rng(0), 15
     frames = t.own.copy()
     frames[10 : 10 + away] = g.normal(0, 0.05, (away, *t.own.shape[1:]))
     found = labelled(rod_of(steel_rod(), S, None), frames)

@@ -105,10 +105,12 @@ def check_loads(family: Any, count: int, locations: tuple[float, ...] | None = N
     Errors: ValueError.
     """
     name = type(family).__name__
-    for scale in ("length", "force_scale", "force_std"):
+    for scale in ("length", "force_std"):
         value = getattr(family, scale)
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name}.{scale} is {value}; it must be positive and finite")
+    if not (math.isfinite(family.force_scale) and family.force_scale >= 0):
+        raise ValueError(f"{name}.force_scale is {family.force_scale} N; it must be finite and not negative")
     if count < 0:
         raise ValueError(f"{name} of {count} loads; give 0 or more")
     if locations is None:
