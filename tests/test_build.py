@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.fresh import Fresh
 from tests.test_fast import needs_compiler
 from torchrod.cli import main
 from torchrod.kernel import bindings, build
@@ -190,7 +191,7 @@ def test_where_folders_cannot_be_locked_two_builds_do_no_harm(tmp_path):
     assert ended(begin(LOADED, cxx, tmp_path / "cache"))[1] == ""
 
 
-ESTIMATE = """
+BUILD = """
 import sys
 from torchrod.cli import main
 sys.exit(main(["build"]))
@@ -200,12 +201,12 @@ sys.exit(main(["build"]))
 def test_ctrl_c_leaves_no_compiler_and_no_file_behind(tmp_path):
     """With one line, and the next command begins anew."""
     cxx, cache = compiler(tmp_path, f"echo $$ > {tmp_path}/pid", 'echo half > "$last"', "sleep 300"), tmp_path / "cache"
-    process = begin(ESTIMATE, cxx, cache)
+    process = Fresh(BUILD, tmp_path, {"PATH": "/usr/bin:/bin", "CXX": str(cxx), "TORCHROD_CACHE": str(cache)})
     waiting(tmp_path, "pid")
     time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=30)
-    assert (process.returncode, err) == (130, f"{build.LINE}\ntorchrod: interrupted\n")
+    os.kill(process.pid, signal.SIGINT)
+    done = process.ended()
+    assert (done.returncode, done.stderr) == (130, f"{build.LINE}\ntorchrod: interrupted\n")
     assert left(cache) == []
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)

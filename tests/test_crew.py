@@ -1,13 +1,13 @@
 """The kernel's threads, which live on: through forks, beside other callers, and no more of them than were asked for."""
 
-import subprocess
-import sys
+import os
 import threading
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests import fresh
 from tests.problems import posed
 from tests.robots import T
 from tests.test_fast import needs_compiler
@@ -68,10 +68,9 @@ linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="no /pro
 
 @needs_compiler
 @linux
-def test_threads_are_begun_once_and_anew_in_a_fork():
+def test_threads_are_begun_once_and_anew_in_a_fork(tmp_path):
     """In a process of its own, which has begun no others. A fork has its own whatever its parent's threads were doing."""
-    root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=False, cwd=root, timeout=120)
+    done = fresh.run(CODE, tmp_path, **os.environ)
     assert done.returncode == 0, done.stderr
 
 

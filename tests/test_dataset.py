@@ -27,7 +27,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
-from torchrod.data import workers as production
+from torchrod.data import workers
 from torchrod.data.dataset import ARRAYS, digest, drawn_load
 from torchrod.data.shards import write_manifest, write_shard
 
@@ -79,19 +79,29 @@ def test_a_shard_is_a_function_of_specification_and_index():
         assert len({first, digest(simulate_shard(s, 0)), digest(simulate_shard(spec(seed=2), 1))}) == 3
 
 
-def test_jobs_and_processes_make_the_same_files(tmp_path, made, capsys):
-    """One process, two processes, three jobs of a cluster in any order: the same files, byte for byte."""
+def same_files(one: Path, other: Path) -> None:
+    """Byte for byte."""
+    names = sorted(p.name for p in one.iterdir())
+    assert len(names) == 2 * SHARDS + 1
+    assert sorted(p.name for p in other.iterdir()) == names
+    for name in names:
+        assert (other / name).read_bytes() == (one / name).read_bytes(), name
+
+
+def test_jobs_make_the_same_files(tmp_path, made, capsys):
+    """Three jobs of a cluster, in any order, and one."""
     first = made("one")
     assert first is not None
-    assert made("two", "--workers", "2") == first
     assert [made("jobs", "--shard", f"{i}/3") for i in (2, 0, 1)] == [None, None, first]
     assert "follows when all 4 shards are there" in capsys.readouterr().out
-    names = sorted(p.name for p in (tmp_path / "one").iterdir())
-    assert len(names) == 2 * SHARDS + 1
-    for other in ("two", "jobs"):
-        assert sorted(p.name for p in (tmp_path / other).iterdir()) == names
-        for name in names:
-            assert (tmp_path / other / name).read_bytes() == (tmp_path / "one" / name).read_bytes(), name
+    same_files(tmp_path / "one", tmp_path / "jobs")
+
+
+@pytest.mark.study
+def test_processes_make_the_same_files(tmp_path, made):
+    """Two of them, and one."""
+    assert made("two", "--workers", "2") == made("one")
+    same_files(tmp_path / "one", tmp_path / "two")
 
 
 def test_only_damaged_and_missing_shards_are_made_again(tmp_path, made, capsys):
@@ -140,7 +150,7 @@ def test_a_killed_worker_of_a_cluster_changes_nothing(tmp_path, made):
 
 def test_a_cluster_that_is_not_there(tmp_path, made, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="dask.distributed is not installed: pip install torchrod[scale]")
-    monkeypatch.setattr(production, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(workers, "CONNECT_SECONDS", 1)
     assert (
         main(["simulate-dataset", str(tmp_path / "d.toml"), "--out", str(tmp_path / "d"), "--scheduler", "tcp://127.0.0.1:9"]) == 2
     )

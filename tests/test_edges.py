@@ -229,6 +229,7 @@ def test_the_flat_strip_of_the_handed_case(options, tmp_path, capsys):
     assert abs(load["location_m"] - 0.2) < 2 * load["std"]["location_m"]
 
 
+@pytest.mark.study
 def test_draws_of_a_flat_backbone_hold_the_force_along_its_soft_side():
     """The other component hardly shows, and is next to nothing: 24 to 39 % of |F| once."""
     robot, generator, B = strip(1e6), torch.Generator().manual_seed(11), 96

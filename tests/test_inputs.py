@@ -10,6 +10,7 @@ from studies.reproduction.cases import S, study1
 from tests.problems import posed
 from tests.robots import busy_robot, steel_rod
 from torchrod import (
+    FourierCoordinates,
     FourierLoads,
     GaussianCoordinates,
     GaussianLoads,
@@ -32,6 +33,7 @@ from torchrod import (
     find_warm_start,
     load_bound,
     place,
+    score_test,
     shape_from_base,
     solve_displacement,
     solve_shape,
@@ -218,3 +220,25 @@ def test_places_off_the_rod():
     for beyond in (torch.tensor([0.1, 0.41]), torch.tensor([-0.1, 0.4]), torch.tensor([0.1, torch.nan])):
         with pytest.raises(ValueError, match=r"outside the rod of 0 to 0.4 m"):
             solve_shape(robot, (), None, beyond, 1)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: GaussianCoordinates(1, 0.4, 1.0, "contacts"), "prior_name is 'contacts'; it must be one of point, contact"),
+        (lambda: GaussianCoordinates(2, 0.4, 1.0, locations=(0.1,)), "locations has 1 places for 2 loads; give one for each"),
+        (lambda: PointCoordinates(1, 0.4, 1.0, (0.5,)), "must lie on the rod, 0 to 0.4 m"),
+        (lambda: GaussianCoordinates(-1, 0.4, 1.0), "-1 loads; give 0 or more"),
+        (lambda: FourierCoordinates(3, 0.4, -1.0), r"force_scale is -1.0 N; it must be finite and not negative"),
+        (lambda: GaussianCoordinates(1, float("nan"), 1.0), "length is nan; it must be positive"),
+    ],
+)
+def test_load_families_that_make_no_sense_are_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+def test_the_score_test_is_of_gaussian_loads():
+    problem = posed(torch.tensor([0.2, 0.4]), torch.zeros(1, 2, 3), loads=PointCoordinates(1, 0.4, 1.0))
+    with pytest.raises(ValueError, match="the loads are PointCoordinates; give a problem with GaussianCoordinates"):
+        score_test(problem, torch.zeros(1, problem.size))

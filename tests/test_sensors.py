@@ -136,43 +136,37 @@ def test_the_jacobian_of_what_is_held_fixed(name):
     check_rows(problem, x)
 
 
-@pytest.mark.parametrize("name", [*SENSORS, *AT_THE_CURVE])
-def test_the_compiled_march_is_the_torch_one(name, monkeypatch):
-    """h and H with tendons, gravity and something at the tip, to 1e-10 of their size."""
-    nowhere = busy(markers(torch.zeros(2, P, 3)))
-    x = somewhere(nowhere)
-    problem = busy(SENSORS[name](2) if name in SENSORS else AT_THE_CURVE[name](curve(nowhere, x) + 1e-3))
-    fast = problem.linearized(x)
-    monkeypatch.setattr(kernel, "available", lambda: False)
-    for mine, definition in zip(fast, problem.linearized(x), strict=True):
-        assert torch.isfinite(definition).all()
-        assert (mine - definition).abs().max() <= 1e-10 * definition.abs().max()
+FEW = ("curvature", "directions with positions")
+CASES = [(name, "") for name in (*SENSORS, *AT_THE_CURVE)] + [(name, kind) for name in FEW for kind in ("tensions", "moving")]
 
 
-MOVING = ("curvature", "directions with positions")
-CASES = [(name, False) for name in (*SENSORS, *AT_THE_CURVE)] + [(name, True) for name in MOVING]
+@pytest.mark.parametrize(("name", "kind"), CASES)
+def test_the_kernel_is_the_torch_model(name, kind, monkeypatch):
+    """h and H of the kernel's walk, and of its march, are those of torch to 1e-10 of their size.
 
-
-@pytest.mark.parametrize(("name", "moving"), CASES)
-def test_the_kernel_is_the_torch_model(name, moving):
-    """h and H, to 1e-10 of their size, with all that can be unknown, and with point loads that move the nodes."""
+    With tendons, gravity, something at the tip and the base frame unknown; tensions as well; and point loads that move the nodes.
+    """
     nowhere = busy(markers(torch.zeros(2, P, 3)))
     sensor = SENSORS[name](2) if name in SENSORS else AT_THE_CURVE[name](curve(nowhere, somewhere(nowhere)) + 1e-3)
     frame = None if sensor.moved(torch.eye(3), torch.zeros(3)) is sensor else Registration()
-    if moving:
+    if kind == "moving":
         problem = Problem(steel_rod(), Unknowns(PointCoordinates(2, L, 1.0), "wrench", registration=frame), [sensor], steps=10)
     else:
-        problem = busy(sensor, 0.1, frame)
+        problem = busy(sensor, 0.1 if kind else None, frame)
     fast, definition = evaluator(problem), TorchEvaluator(problem)
     x = somewhere(problem)
     x[:, 2] = T([0.3, -0.4])  # no two loads at one place
     assert isinstance(fast, KernelEvaluator if name == "markers of own noise" else SensorEvaluator)
-    (h, H), (own, slope) = fast.linearized(x), definition.linearized(x)
+    found = [*fast.linearized(x), fast.h(x), fast.take(T([1])).h(x[1:]), fast.cost(x)]
+    marched = [] if kind else problem.linearized(x)  # the other kinds are not marched by the kernel
+    monkeypatch.setattr(kernel, "available", lambda: False)
+    h, H = definition.linearized(x)
+    assert torch.isfinite(H).all()
     read = problem.weights > 0
-    for mine, other in ((h, own), (H, slope), (fast.h(x), own), (fast.take(T([1])).h(x[1:]), own[1:])):
+    for mine, other in zip([*found[:4], *marched], [h, H, h, h[1:], h, H][: 4 + len(marched)], strict=True):
         some = read[-len(mine) :]
         assert (mine - other)[some].abs().max() <= 1e-10 * other[some].abs().max()
-    assert torch.allclose(fast.cost(x), definition.cost(x), rtol=1e-9)
+    assert torch.allclose(found[4], definition.cost(x), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", [*SENSORS, *AT_THE_CURVE])

@@ -249,7 +249,7 @@ def test_a_learned_start_steps_aside_and_other_unknowns_stay():
 
 @pytest.mark.parametrize(("robot", "nu"), [(steel_rod, math.inf), (busy_robot, 5.0)])
 def test_the_kernel_on_every_robot_nearby_is_the_torch_model(robot, nu):
-    problem = problem_of(robot(), EVERY, 2, registration=Registration())
+    problem = problem_of(robot(), replace(EVERY, curvature_length=0.2), 2, registration=Registration())  # two bumps of curvature
     x = 0.3 * torch.randn(2, problem.size, generator=torch.Generator().manual_seed(0))
     fast, slow = evaluator(problem, nu), TorchEvaluator(problem, nu)
     assert isinstance(fast, NearlyKnownEvaluator)

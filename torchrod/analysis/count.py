@@ -163,7 +163,14 @@ def select(
     start: StartFor = always_cold,
     bar: Bar = no_bar,
 ) -> tuple[Estimate, Evidence]:
-    """The fit of the hypothesis that `selection` chooses for each sample, and why."""
+    """For each sample the fit of the hypothesis of least BIC, and what spoke for every one of them.
+
+    problem: robot and readings of B samples; its unknowns are replaced by each candidate's. candidates: H hypotheses, the fewest
+    contacts first, each tried where the score test of the one before promises that it is worth its parameters. start: the rule
+    that the fits begin by where no earlier fit suggests anything better. bar: shows progress, called with a total and a name.
+    In the estimate, loads that a sample's hypothesis does not have are NaN. Errors: ValueError where no sample has enough markers
+    for any load. Source: Schwarz 1978 (BIC); Rao 1948 (score test).
+    """
     found = selection(problem, candidates, settings, start, bar)
     return found.fit, found.evidence
 

@@ -310,7 +310,9 @@ def diagnose(
 
     parts: of the batch, each with the unknowns it was fitted by; None: all by the problem's own. Where there are several, the
     number of loads was chosen from the data, and an error of the base frame may have passed for loads: accepted fits of two loads
-    and more are looked at as well. Costs a few more fits of these samples, and nothing for the others.
+    and more are looked at as well. Costs a few more fits of these samples, and nothing for the others. Samples that no fit can
+    explain have nothing said of them; nothing is raised. Source: what each mistake is told by, and how often that is right, is in
+    docs/trust.md.
     """
     parts = [(problem.unknowns, torch.arange(problem.batch))] if parts is None else parts
     hasty, B = replace(settings or Settings(), restarts=(), max_iterations=ITERATIONS), len(fit.status)

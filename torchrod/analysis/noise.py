@@ -31,15 +31,16 @@ from ..model.unknowns import Unknowns
 FIRST = 1 / 400  # of the rod's length: 1 mm on the paper's
 ROUNDS = 6
 SETTLED = 0.01  # relative change of sigma
-LEAST = 1e-5  # of the rod's length: no rod is a rod to less, and neither the width of a load nor the steps of the model count there
+LEAST = 1e-5  # of the rod's length: less is finer than what the width of a load and the steps of the model leave
 SMOOTH = 3.09  # standard deviations of rho: 99.9 %
 
 
 @dataclass(frozen=True)
 class Noise:
-    """sigma (B,) m and its standard deviation, std (B,) m; freedom (B,): nu of (1). NaN where nothing is left to tell it from.
+    """sigma (B,) m and its standard deviation, std (B,) m; freedom (B,): nu, the degrees of freedom of the residual.
 
-    std is 0 where the residual is smaller than LEAST, which then stands in for sigma, and chi^2 is a test as ever.
+    NaN where nothing is left to tell it from. std is 0 where the residual is smaller than LEAST, which then stands in for sigma,
+    and chi^2 is a test as ever. Source: (1) of torchrod/analysis/noise.py.
     """
 
     sigma: Float[Tensor, " B"]
@@ -128,7 +129,7 @@ def estimate_noise_among(
     where a poorer one leaves less, the fit of the richest has not settled, and the poorer one tells it. Without that a tenth of the
     samples without a load, and 3 % of those with one, get a noise up to 14 times too large when it is 0.2 mm. Unknowns without a
     load never stand in for those that have too few markers: they would take a load for noise. Nor do any that leave more markers
-    aside as outliers: a robust fit with too few loads calls most of them so.
+    aside as outliers: a robust fit with too few loads calls most of them so. Errors: ValueError as estimate_noise.
     """
     problems = [problem.of(unknowns) for unknowns in candidates]
     fitting = [p for p in problems if p.determined] or problems[:1]

@@ -160,12 +160,13 @@ def load_bound(
     steps: int = 0,
     uncertainty: Uncertainty | None = None,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
-    """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, by (1).
+    """Cramer-Rao bounds (standard deviations) of location (m) and magnitude (N) of one push, (B,) each.
 
-    force: N, section frame, not zero; location: m, inside the rod; base_wrench: N, N m, in equilibrium with the push; tension: N.
-    Markers count with their noise where their positions are finite; the numbers play no part. registration: what is known of a base
-    frame that is unknown; uncertainty: what is only nearly known of the robot.
-    A bound is inf where the markers do not show the push, NaN where the base wrench is.
+    force: (B, 2) N, section frame, not zero; location: (B,) m, inside the rod; base_wrench: (B, 6) N, N m, in equilibrium with the
+    push; tension: (B, T) or (T,) N. Markers count with their noise where their positions are finite; the numbers play no part.
+    registration: what is known of a base frame that is unknown; uncertainty: what is only nearly known of the robot. A bound is inf
+    where the markers do not show the push, NaN where the base wrench is. Source: (1) to (3) of torchrod/analysis/observability.py;
+    Kay 1993, ch. 3.
     """
     force, location, base_wrench = as_float64(force), as_float64(location), as_float64(base_wrench)
     problem = push_problem(robot, markers, tension, registration, steps, uncertainty)
@@ -244,7 +245,7 @@ def bounds(
     force: its magnitude (N) for the bounds. tension: readings of the tendons (N). Localizable: the smallest force at which the
     location's standard deviation is 5 % of L, on a ladder that turns the rod by 0.02 to 1.62 rad at the push (F s^2 / 2 EI).
     registration, uncertainty: what is known of a base frame that is unknown, and of a robot that is only nearly known.
-    Errors: ValueError for markers, force, noise or tensions that do not fit the robot.
+    Errors: ValueError for markers, force, noise or tensions that do not fit the robot. Source: Kay 1993, ch. 3 (see the module).
     """
     check(robot, s, noise, force, tension)
     at = places(robot, PLACES) if locations is None else as_float64(locations)

@@ -37,7 +37,10 @@ class _WithCandidates:
 
     fitted: GaussianCoordinates
     places: tuple[float, ...]
-    informative_priors: int = 0
+
+    @property
+    def informative_priors(self) -> int:
+        return 0
 
     @property
     def size(self) -> int:
@@ -76,9 +79,15 @@ class ScoreTest:
 
 
 def score_test(problem: Problem, x: Float[Tensor, "B n"]) -> ScoreTest:
-    """The score test (1)-(4) at the fit x of a problem, whose loads must be Gaussians."""
+    """The score test of one load more, at the fit x (B, n) of a problem with Gaussian loads, in the units of Problem.state.
+
+    It evaluates the model once, at x, with a point-like load of no force at each of PLACES places, and tells what a first-order
+    step of its force would take off the cost. Errors: ValueError for loads of another family. Source: Rao 1948; (1)-(4) of
+    torchrod/analysis/score_test.py.
+    """
     fitted = problem.unknowns.loads
-    assert isinstance(fitted, GaussianCoordinates)
+    if not isinstance(fitted, GaussianCoordinates):
+        raise ValueError(f"score_test: the loads are {type(fitted).__name__}; give a problem with GaussianCoordinates")
     L, n, g = fitted.length, problem.size, fitted.size
     places = tuple(L * (j + 1) / PLACES for j in range(PLACES))
     wide = problem.of(replace(problem.unknowns, loads=_WithCandidates(fitted, places)))

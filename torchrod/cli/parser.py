@@ -235,7 +235,7 @@ def _build_parser() -> ArgumentParser:
 
 COMMANDS = {
     "estimate": (_estimate_parser, "loads from marker positions"),
-    "calibrate": (_calibrate_parser, "mass per length from unloaded shapes"),
+    "calibrate": (_calibrate_parser, "what the robot file does not say well enough, from shapes under known loads"),
     "observability": (_observability_parser, "what markers will see, and where to put them"),
     "simulate": (_simulate_parser, "marker positions from known loads"),
     "simulate-dataset": (_dataset_parser, "many shapes of random loads, for learning and studies"),

@@ -55,6 +55,7 @@ class DatasetSpec:
     Gaussian; None for points) and markers: fractions of the rod's length. noise: m, on every coordinate. tension: N, None without
     tendons. gravity: magnitude (m/s^2) in a direction drawn anew for every sample; None leaves the robot's own.
     contact_friction: mu of contacts that drag along the rod, each by a force drawn from N(0, (mu |F|)^2); None: none does.
+    read_dataset_spec checks what a file says; a specification made in Python is taken as it is.
     """
 
     robots: tuple[Robot, ...]

@@ -172,7 +172,7 @@ class Limits(NamedTuple):
     gain: converged, too, when the step that is taken, damped as it is, promises less than this; 0: never. For a recursion that
     creeps along a direction in which the cost has no minimum (the paper's width c).
     settled: the cost with adapted weights is at its minimum when a step promises less than this. The step that shows that the
-    filter has arrived is taken nevertheless: it is there already, and leaves of the promised decrement next to nothing.
+    filter has arrived is still taken: it has been computed already, and removes nearly all of the decrement that it promises.
     exact: steps keep (7). What they promise is then dx^T A dx, the change of what is read, which counts the way back to c = 0, too.
     """
 

@@ -136,7 +136,7 @@ def sampled_intervals(
     """Intervals from draws of every sample; loads and entries that a sample's unknowns do not have are NaN.
 
     parts: of the batch, each with the unknowns it was fitted by (analysis.count); None: all by the problem's. draws, nu: see
-    posterior_draws.
+    posterior_draws. Errors: ValueError for an estimate of other unknowns. Source: Vehtari et al., JMLR 2024.
     """
     parts = [(problem.unknowns, torch.arange(problem.batch))] if parts is None else parts
     found = Collected(estimate)

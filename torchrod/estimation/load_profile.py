@@ -132,7 +132,8 @@ def load_profile(
 ) -> Profile | None:
     """f(s) at `nodes` evenly spaced places from base to tip, with its band; None for point loads, which have no density.
 
-    x, covariance: of torchrod.Estimate. The draws are always the same: equal fits have equal bands, whatever their batch.
+    x (B, n), covariance (B, n, n): of torchrod.Estimate, in the units of Problem.state. The draws are always the same: equal fits
+    have equal bands, whatever their batch.
     """
     family, at, s = (
         problem.unknowns.loads,

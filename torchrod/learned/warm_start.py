@@ -32,7 +32,7 @@ class WarmStart:
 
     predicted_spread: let the filter begin with the network's own covariance of gamma instead of the settings' Sigma0; by default
     as the card has it, which is as it did better (docs/training.md). strict: refuse what the network was not trained for, instead
-    of starting cold there.
+    of starting cold there. Errors: InputError, when it is called with a problem it was not trained for.
     """
 
     network: Network

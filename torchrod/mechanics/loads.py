@@ -99,7 +99,7 @@ def _per_stage(parameter: Tensor, trailing: int) -> Tensor:
 
 @dataclass(frozen=True)
 class GaussianLoads(Float64):
-    """f(s) = sum_k a_k exp(-c_k (s - mu_k)^2), (10), with 2 c = 1 / sigma^2.
+    """f(s) = sum_k a_k exp(-c_k (s - mu_k)^2), the paper's (10), with 2 c = 1 / sigma^2.
 
     a: (..., K, 2), N/m, section frame x and y; or (..., K, 3), with drag along the rod. mu: (..., K), m. c: (..., K), 1/m^2.
     """
@@ -175,7 +175,7 @@ class PointForces(Float64):
 class PointWrenches(Float64):
     """Known forces (N) and moments (N m), (..., K, 3), at s (K,) m.
 
-    frame "local" turns with the section, "base" keeps its direction.
+    frame "local" turns with the section, "base" keeps its direction. Errors: ValueError for another frame.
     """
 
     force: Float[Tensor, "... K 3"]
@@ -213,7 +213,8 @@ class PointWrenches(Float64):
 class FourierLoads(Float64):
     """f(s) = a_0 + sum_k a_k cos(2 pi k s / L) + b_k sin(2 pi k s / L), k = 1..K periods on the rod.
 
-    cosine: (..., 2, K + 1) with a_0 first; sine: (..., 2, K); N/m, section frame x and y.
+    cosine: (..., 2, K + 1) with a_0 first; sine: (..., 2, K); N/m, section frame x and y. length: L (m). Errors: ValueError for a
+    length that is not positive.
     """
 
     cosine: Float[Tensor, "... 2 K1"]
@@ -258,7 +259,10 @@ class FourierLoads(Float64):
 
 @dataclass(frozen=True)
 class PolynomialLoads(Float64):
-    """f(s) = sum_k a_k (s / L)^k. coefficients: (..., 2, K), N/m, section frame x and y."""
+    """f(s) = sum_k a_k (s / L)^k, k = 0..K - 1. coefficients: (..., 2, K), N/m, section frame x and y. length: L (m).
+
+    Errors: ValueError for a length that is not positive.
+    """
 
     coefficients: Float[Tensor, "... 2 K"]
     length: float

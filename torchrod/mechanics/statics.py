@@ -98,7 +98,8 @@ def base_state(robot: Robot, alpha: Float[Tensor, "... 6"], table: StageTable) -
 class Shape:
     """The rod at the outputs: p (..., P, 3) m, q (..., P, 4), and the tip residual c (..., 6) [N, N m], section frame.
 
-    tip_q: (..., 4), the orientation of the last section. wrench: (..., P, 6), [N~ (N), M~ (N m)] of mechanics.section (1).
+    q: the section's orientation in the base frame, unit quaternions (x, y, z, w). p: base frame. tip_q: (..., 4), the orientation
+    of the last section. wrench: (..., P, 6), [N~ (N), M~ (N m)] of mechanics.section (1).
     """
 
     p: Float[Tensor, "... P 3"]
@@ -147,10 +148,10 @@ def shape_from_base(
 class Equilibrium:
     """The forward solve's answer, one entry per sample.
 
-    s: (P,) m. p: (B, P, 3) m and q: (B, P, 4), base frame. base_wrench: (B, 6) = [n(0) N, m(0) N m], the whole section's.
-    status: (B,) Status codes; residual: (B,) rad, the angle by which the base misses its clamp; iterations: (B,).
-    stable: (B,), whether a rod would stay there (mechanics.stability). resolved: (B,), whether the steps follow the load.
-    A sample that is not all of these holds NaN, is NOT_CONVERGED and has disturbed nobody.
+    s: (P,) m. p: (B, P, 3) m and q: (B, P, 4), unit quaternions (x, y, z, w), both in the base frame. base_wrench: (B, 6) = [n(0)
+    N, m(0) N m], the whole section's. status: (B,) Status codes; residual: (B,) rad, the angle by which the base misses its clamp;
+    iterations: (B,). stable: (B,), whether a rod would stay there (mechanics.stability). resolved: (B,), whether the steps follow
+    the load. A sample that is not all of these holds NaN, is NOT_CONVERGED and has disturbed nobody.
     """
 
     s: Float[Tensor, " P"]

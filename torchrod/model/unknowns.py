@@ -40,7 +40,8 @@ class Registration:
 
     shift_std (m), turn_std (rad): standard deviations of each component about zero; None: 5 % of the length and 10 degrees, what a
     base frame is off by after it was once set up. A wider prior lets an unlikely frame pass for a push near the base, a narrower
-    one is worth having (docs/trust.md). scope: SHARED where a camera that stood still is off by the same in all samples.
+    one is worth having (docs/trust.md). scope: SHARED where a camera that stood still is off by the same in all samples. Errors:
+    ValueError for what is no standard deviation.
     """
 
     shift_std: float | None = None
@@ -152,7 +153,8 @@ class Unknowns:
     through the base wrench alone, so it costs no tangent of the march. tension_std: standard deviation (N) of the tensions'
     sensors, whose errors are then unknown; None takes the tensions as exact. registration: the base frame's error; None takes the
     frame as exact. scaled: the base wrench in the rod's force and moment scales and zeta in tenths of L and of a radian; otherwise
-    in SI (the paper's).
+    in SI (the paper's). uncertainty: what is only nearly known of the robot, whose errors are then unknown; None takes it as exact.
+    Errors: ValueError for another tip, a standard deviation that is not positive, and tension_std beside an uncertainty.
     """
 
     loads: LoadFamily

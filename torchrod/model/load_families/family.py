@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -97,6 +97,29 @@ def check_friction(friction: float | None) -> None:
     """Refuse what is no coefficient of friction. Errors: ValueError."""
     if friction is not None and not friction > 0:
         raise ValueError(f"friction is {friction}; a contact's must be positive, infinite where the axial force is free, or None")
+
+
+def check_loads(family: Any, count: int, locations: tuple[float, ...] | None = None) -> None:
+    """Refuse scales (fields of the family) that are not positive, and places (m) that are not `count` or not on the rod.
+
+    Errors: ValueError.
+    """
+    name = type(family).__name__
+    for scale in ("length", "force_std"):
+        value = getattr(family, scale)
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name}.{scale} is {value}; it must be positive and finite")
+    if not (math.isfinite(family.force_scale) and family.force_scale >= 0):
+        raise ValueError(f"{name}.force_scale is {family.force_scale} N; it must be finite and not negative")
+    if count < 0:
+        raise ValueError(f"{name} of {count} loads; give 0 or more")
+    if locations is None:
+        return
+    length = family.length
+    if len(locations) != count:
+        raise ValueError(f"{name}.locations has {len(locations)} places for {count} loads; give one for each")
+    if not all(0 <= s <= length * (1 + 1e-9) for s in locations):
+        raise ValueError(f"{name}.locations is {locations}; they must lie on the rod, 0 to {length} m")
 
 
 def single_loads() -> tuple[Float[Tensor, "C 2"], Float[Tensor, " C"]]:

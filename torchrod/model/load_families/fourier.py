@@ -8,21 +8,29 @@ from torch import Tensor
 
 from ...mechanics.loads import FourierLoads, Load
 from ...util.precision import DTYPE
-from .family import WEAK_STD, Gamma, LoadReport
+from .family import WEAK_STD, Gamma, LoadReport, check_loads
 
 
 @dataclass(frozen=True)
 class FourierCoordinates:
-    """A Fourier series of `periods` periods: [a_0..a_K, b_1..b_K] for x, then for y, in units of force scale / L.
+    """A Fourier series of `periods` periods (K): gamma is [a_0..a_K, b_1..b_K] for x, then for y, in units of force scale / L.
 
-    force_std: standard deviation of each coefficient's prior about zero, in those units; weak by default.
+    f(s) is that of FourierLoads. length: L (m). force_scale: of the rod (N). force_std: standard deviation of each coefficient's
+    prior about zero, in the units of gamma; weak by default. Errors: ValueError for scales that are not positive.
     """
 
     periods: int
     length: float
     force_scale: float
     force_std: float = WEAK_STD
-    informative_priors: int = 0
+
+    def __post_init__(self):
+        check_loads(self, self.periods)
+
+    @property
+    def informative_priors(self) -> int:
+        """None."""
+        return 0
 
     @property
     def size(self) -> int:

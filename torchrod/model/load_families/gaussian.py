@@ -17,6 +17,7 @@ from .family import (
     along_rod,
     axial_std,
     check_friction,
+    check_loads,
     logit,
     single_loads,
 )
@@ -36,6 +37,9 @@ class GaussianCoordinates:
     tip, where (13) does not. A known location leaves eta out. friction: mu of contacts that may drag along the rod, each by
     F_z ~ N(0, (mu |F|)^2); infinite: F_z is free; None: loads are normal to the rod. It adds a last entry xi (`along_rod`).
     force_std: standard deviation of each force component's prior about zero, in force scales; weak by default.
+    length: L (m). force_scale: of the rod (N). prior_name: what is known of a width, log(c L^2) +-1 about sigma = L / 100
+    ("point"), L / 40 ("contact") or L / 4 ("distributed"), or "none". locations: known ones (m), one for each load. Errors:
+    ValueError for scales that are not positive, another prior, and locations that are not on the rod. Source: the paper, (10).
     """
 
     count: int
@@ -50,6 +54,10 @@ class GaussianCoordinates:
         check_friction(self.friction)
         if self.locations is not None:  # what is kept from call to call is kept by a hash, which a list has not
             object.__setattr__(self, "locations", tuple(self.locations))
+        check_loads(self, self.count, self.locations)
+        if self.prior_name not in (*WIDTH_OF_PRIOR, "none"):
+            known = ", ".join((*WIDTH_OF_PRIOR, "none"))
+            raise ValueError(f"GaussianCoordinates.prior_name is {self.prior_name!r}; it must be one of {known}")
 
     @property
     def per_load(self) -> int:

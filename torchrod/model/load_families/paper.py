@@ -33,7 +33,6 @@ class PaperCoordinates:
     eps: float = 1.0
     beta1: float = 0.0
     beta2: float | None = None
-    informative_priors: int = 0
 
     def __post_init__(self):
         if self.beta2 is None:
@@ -56,6 +55,11 @@ class PaperCoordinates:
         """beta1 and beta2 (m)."""
         assert self.beta2 is not None
         return self.beta1, self.beta2
+
+    @property
+    def informative_priors(self) -> int:
+        """None."""
+        return 0
 
     @property
     def size(self) -> int:

@@ -17,6 +17,7 @@ from .family import (
     along_rod,
     axial_std,
     check_friction,
+    check_loads,
     logit,
     single_loads,
 )
@@ -26,8 +27,9 @@ from .family import (
 class PointCoordinates:
     """Point forces: per load [F_x, F_y, eta], or [F_x, F_y] at known locations (m), and xi where there is a force along the rod.
 
+    Forces are in units of the rod's force scale (N), and the location is L S(eta) as in GaussianCoordinates. length: L (m).
     force_std: standard deviation of each force component's prior about zero, in force scales; weak by default. friction: as in
-    GaussianCoordinates.
+    GaussianCoordinates. Errors: ValueError as there.
     """
 
     count: int
@@ -41,6 +43,7 @@ class PointCoordinates:
         check_friction(self.friction)
         if self.locations is not None:  # what is kept from call to call is kept by a hash, which a list has not
             object.__setattr__(self, "locations", tuple(self.locations))
+        check_loads(self, self.count, self.locations)
 
     @property
     def per_load(self) -> int:
