@@ -28,6 +28,7 @@ D = torch.float64
 PLATE = torch.tensor([[30.0, 0, 0], [-20, 25, 0], [-20, -25, 0], [10, 15, 8]], dtype=D) * 1e-3
 WIDTH = L / 100  # m: of a point-like load
 PULL_STD = 0.05  # N
+MANY, TAKES = 600, 10  # frames; takes of a case that has fewer
 HANGS = Rotation.from_rotvec([0.0, math.pi, 0.0]) * Rotation.from_rotvec([0.4, 0.2, -0.9])  # down, and turned
 TURN = torch.from_numpy(HANGS.as_matrix())
 ORIGIN = torch.tensor([0.3, -1.2, 0.8], dtype=D)
@@ -104,10 +105,22 @@ def _bound(case: Case) -> Tensor:
 
 @dataclass(frozen=True)
 class Errors:
-    """Of accepted fits: names with the rms error (SI) and the same over the bound; accepted: a share."""
+    """Of accepted fits: names with the rms error (SI) and the same over the bound; accepted: a share of the frames."""
 
+    frames: int
     accepted: float
     of: dict[str, tuple[float, float]]
+
+    @classmethod
+    def of_all(cls, takes: "list[Errors]") -> "Errors":
+        """Of takes as long as each other, together."""
+        share = torch.tensor([take.accepted for take in takes])
+
+        def whole(values: list[float]) -> float:
+            return float(((share * torch.tensor(values).square()).sum() / share.sum()).sqrt())
+
+        of = {name: (whole([t.of[name][0] for t in takes]), whole([t.of[name][1] for t in takes])) for name in takes[0].of}
+        return cls(sum(take.frames for take in takes), float(share.mean()), of)
 
 
 def judged(case: Case, result: Path) -> Errors:
@@ -124,7 +137,7 @@ def judged(case: Case, result: Path) -> Errors:
         error = torch.tensor([r["tip"]["force_N"] for r in records]) - truth.tip
         over = (case.tip - torch.tensor([r["chi2"] for r in records])).clamp(min=0) / 3
         found = {"force, by the likelihood": (_rms(error[ok, :2].flatten()), float(over[ok].mean().sqrt()))}
-        return Errors(float(ok.double().mean()), found)
+        return Errors(len(ok), float(ok.double().mean()), found)
     C = _bound(case)
     size = truth.force.norm(dim=-1)
     way = truth.force / size.unsqueeze(-1)
@@ -132,7 +145,8 @@ def judged(case: Case, result: Path) -> Errors:
     force = torch.tensor([r["loads"][0]["magnitude_N"] for r in records]) - size
     place = torch.tensor([r["loads"][0]["location_m"] for r in records]) - truth.place
     errors = {"force": force, "place": place}
-    return Errors(float(ok.double().mean()), {n: (_rms(e[ok]), _rms((e / variance[n].sqrt())[ok])) for n, e in errors.items()})
+    over = {n: (_rms(e[ok]), _rms((e / variance[n].sqrt())[ok])) for n, e in errors.items()}
+    return Errors(len(ok), float(ok.double().mean()), over)
 
 
 def _rms(x: Tensor) -> float:
@@ -153,7 +167,7 @@ def _put(folder: Path, files: dict[str, str]) -> None:
         (folder / name).write_text(text + "\n")
 
 
-def motive(folder: Path, seed: int = 0, frames: int = 600) -> Case:
+def motive(folder: Path, seed: int = 0, frames: int = MANY) -> Case:
     """A take without labels: y up, millimetres, the base away from the origin and upside down, 5 % of the markers missing."""
     truth, s, g = Truth.take(frames), torch.linspace(0.02, L, 20), np.random.default_rng(seed)
     clean = truth.at(steel_rod(), s)
@@ -279,7 +293,7 @@ def tensions(folder: Path, seed: int = 0, frames: int = 60) -> Case:
     return Case([command], truth, robot, s, lambda shape: (shape.p / 1e-3).flatten(1))
 
 
-CASES: dict[str, Callable[[Path], Case]] = {
+CASES: dict[str, Callable[[Path, int], Case]] = {
     "Motive, 600 frames without labels": motive,
     "three Aurora sensors": aurora,
     "20 gratings of three cores": gratings,

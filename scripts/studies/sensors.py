@@ -6,7 +6,7 @@ else is worked out from those here, not by the library's sensors.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import roma
 import torch
@@ -27,13 +27,17 @@ from torchrod import (
     PointWrenches,
     Poses,
     Problem,
+    Robot,
     Sensor,
+    Tendon,
+    Tendons,
     TipWrench,
+    Uncertainty,
     Unknowns,
     estimate,
+    sampled_intervals,
     solve_shape,
 )
-from torchrod.mechanics.loads import Load
 
 D = torch.float64
 ROBOT = steel_rod()
@@ -61,21 +65,6 @@ class Sections:
     base: Tensor
     tip: Tensor
     R_tip: Tensor
-
-
-def sections(loads: tuple[Load, ...], tip: Tensor, s: Tensor) -> Sections:
-    """Of the rod under loads and a dead force (B, 3) N at its tip."""
-    push = PointWrenches(tip.unsqueeze(1), torch.zeros_like(tip).unsqueeze(1), torch.tensor([L]))
-    below, above = (s - DS).clamp(min=0), (s + DS).clamp(max=L)
-    shape = solve_shape(ROBOT, (*loads, push), None, torch.cat([s, below, above, torch.tensor([L])]), len(tip), STEPS)
-    P = len(s)
-    p, q = shape.p, shape.q
-    R = roma.unitquat_to_rotmat(q)
-    h = (above - below).unsqueeze(-1)
-    u = roma.rotmat_to_rotvec(R[:, P : 2 * P].mT @ R[:, 2 * P : 3 * P]) / h
-    v = (R[:, :P].mT @ ((p[:, 2 * P : 3 * P] - p[:, P : 2 * P]) / h).unsqueeze(-1)).squeeze(-1)
-    wrench = torch.cat([tip, torch.zeros_like(tip)], -1)
-    return Sections(p[:, :P], R[:, :P], v, u, shape.base_wrench, wrench, R[:, -1])
 
 
 @dataclass(frozen=True)
@@ -183,9 +172,9 @@ def uncertain_s(noise: float = 3e-4, s_std: float = 2e-3) -> Form:
     return Form(inner, raw, torch.ones(9 * P), sensor, noisy, information)
 
 
-def poses(noise: float = 5e-4, angle: float = math.radians(0.5)) -> Form:
-    """Positions and orientations of five sensors. The raw numbers: p, then R."""
-    P = len(FEW)
+def poses(s: Tensor = FEW, noise: float = 5e-4, angle: float = math.radians(0.5)) -> Form:
+    """Positions and orientations. The raw numbers: p, then R."""
+    P = len(s)
 
     def noisy(z: Tensor, draw: Tensor) -> Tensor:
         p, R = z.split([3 * P, 9 * P], -1)
@@ -193,10 +182,10 @@ def poses(noise: float = 5e-4, angle: float = math.radians(0.5)) -> Form:
 
     def sensor(z: Tensor) -> Poses:
         p, R = z.split([3 * P, 9 * P], -1)
-        return Poses(FEW, _in_threes(p), roma.rotmat_to_unitquat(R.unflatten(-1, (-1, 3, 3))), noise, angle)
+        return Poses(s, _in_threes(p), roma.rotmat_to_unitquat(R.unflatten(-1, (-1, 3, 3))), noise, angle)
 
     std = torch.cat([torch.full((3 * P,), noise), torch.full((9 * P,), angle * math.sqrt(2))])  # |dR|^2 = 2 |dphi|^2
-    return Form(FEW, lambda at: torch.cat([_flat(at.p), _flat(at.R)], -1), std, sensor, noisy)
+    return Form(s, lambda at: torch.cat([_flat(at.p), _flat(at.R)], -1), std, sensor, noisy)
 
 
 def directions(placed: bool = False, noise: float = 5e-4, angle: float = math.radians(0.5)) -> Form:
@@ -300,115 +289,199 @@ def camera(where: Sequence[float] = (0.8, 0.1, 0.2), noise: float = 0.3) -> Form
 
 
 OTHER_EYE = (0.1, 0.8, 0.2)
-CASES: dict[str, Callable[[], tuple[Form, ...]]] = {
-    "20 markers, 1 mm": lambda: (markers(),),
-    "20 markers, 0.5 to 3 mm": lambda: (own_noise(),),
-    "20 markers, 1 mm, 5 mm in depth": lambda: (stereo(),),
-    "20 markers, 0.3 mm, s off by 2 mm": lambda: (uncertain_s(),),
-    "5 poses, 0.5 mm, 0.5 degrees": lambda: (poses(),),
-    "10 directions, 0.5 degrees": lambda: (directions(),),
-    "5 directions, 0.5 degrees, with positions, 0.5 mm": lambda: (directions(True),),
-    "20 gratings, 0.05 1/m": lambda: (curvature(),),
-    "20 gratings of 4 cores, 15 microstrain": lambda: (core_strains(),),
-    "base wrench, 20 mN, 2 mN m": lambda: (base_wrench(),),
-    "centre line, 60 points, 1 mm": lambda: (centre_line(),),
-    "centre line, ordered": lambda: (centre_line(ordered=True),),
-    "one camera, 0.3 px": lambda: (camera(),),
-    "two cameras, 0.3 px": lambda: (camera(), camera(OTHER_EYE)),
-    "20 gratings and a tip pose": lambda: (curvature(), poses()),
-    "5 markers, base wrench, tip wrench": lambda: (markers(FEW), base_wrench(), tip_wrench()),
-    "one camera and the gratings": lambda: (camera(), curvature()),
-    "centre line and 5 directions": lambda: (centre_line(), directions(True)),
-}
+RUBBING = Tendons(tuple(Tendon(((0.0, x, 0.0),), L, friction=0.2) for x in (0.007, -0.007)))
 
 
 @dataclass(frozen=True)
 class Push:
-    """Forces (B, 2) N at places (B,) m, in the section frame, and a dead force (B, 3) N at the tip, base frame."""
+    """Forces (B, 2) N at places (B,) m, in the section frame, and a dead force (B, 3) N at the tip, base frame, on robots with
+    tensions (T,) N that are so many times (B,) as stiff as `robot`.
+    """
 
     force: Tensor
     place: Tensor
     tip: Tensor
+    stiffer: Tensor
+    robot: Robot = ROBOT
+    tension: Tensor | None = None
 
-    @classmethod
-    def drawn(cls, count: int, seed: int, tip: bool) -> "Push":
+    def at(self, s: Tensor) -> Sections:
+        """The true sections at s under point forces."""
+        force = torch.cat([self.force, torch.zeros_like(self.place).unsqueeze(-1)], -1)
+        return self.under(PointForces(self._less(force).unsqueeze(1), self.place.unsqueeze(1)), s)
+
+    def spread(self, c: Tensor, s: Tensor) -> Sections:
+        """The same with Gaussians of sharpness c (B,) 1/m^2."""
+        a = self._less(self.force) * (c / math.pi).sqrt().unsqueeze(-1)
+        return self.under(GaussianLoads(a.unsqueeze(1), self.place.unsqueeze(1), c.unsqueeze(-1)), s)
+
+    def _less(self, force: Tensor) -> Tensor:
+        """On a robot k times as stiff a force does what the kth part of it does on `robot`."""
+        return force / self.stiffer.unsqueeze(-1)
+
+    def under(self, load: PointForces | GaussianLoads, s: Tensor) -> Sections:
+        """The sections under a load that is already less, and what else there is."""
+        B, P = len(self.place), len(s)
+        tip = self._less(self.tip).unsqueeze(1)
+        tension = None if self.tension is None else self._less(self.tension.expand(B, -1))
+        below, above = (s - DS).clamp(min=0), (s + DS).clamp(max=L)
+        at = torch.cat([s, below, above, torch.tensor([L])])
+        loads = (load, PointWrenches(tip, torch.zeros_like(tip), torch.tensor([L])))
+        shape = solve_shape(self.robot, loads, tension, at, B, STEPS)
+        p, R = shape.p, roma.unitquat_to_rotmat(shape.q)
+        h = (above - below).unsqueeze(-1)
+        u = roma.rotmat_to_rotvec(R[:, P : 2 * P].mT @ R[:, 2 * P : 3 * P]) / h
+        v = (R[:, :P].mT @ ((p[:, 2 * P : 3 * P] - p[:, P : 2 * P]) / h).unsqueeze(-1)).squeeze(-1)
+        wrench = torch.cat([self.tip, torch.zeros_like(self.tip)], -1)
+        return Sections(p[:, :P], R[:, :P], v, u, self.stiffer.unsqueeze(-1) * shape.base_wrench, wrench, R[:, -1])
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One number of a push: rms error (SI) of the fits, the same over the bound; the mean of their standard deviation over the
+    bound's; the shares of 95 % intervals that hold it, of the covariance's and of those from draws.
+    """
+
+    error: float
+    over_bound: float
+    spread: float
+    covered: float
+    drawn: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """accepted: a share. Of accepted fits: force, and place."""
+
+    accepted: float
+    force: Judged
+    place: Judged
+
+
+@dataclass(frozen=True)
+class Case:
+    """What measures at once, on a robot with tensions (N) whose stiffness is known to a standard deviation (relative)."""
+
+    forms: tuple[Form, ...]
+    robot: Robot = ROBOT
+    tension: tuple[float, ...] = ()
+    stiffness: float = 0.0
+
+    @property
+    def tip(self) -> bool:
+        """Whether the force at the tip is unknown."""
+        return any(form.tip for form in self.forms)
+
+    def pushes(self, count: int, seed: int) -> Push:
         """0.5 to 1 N at 10 to 39 cm, as in Study 1, and up to 0.1 N in each direction at the tip."""
         generator = torch.Generator().manual_seed(seed)
         size, angle, place = torch.rand(3, count, generator=generator)
         size, angle = 0.5 + 0.5 * size, 2 * math.pi * angle
         force = torch.stack([size * angle.cos(), size * angle.sin()], -1)
-        return cls(force, 0.1 + 0.29 * place, (0.2 * torch.rand(count, 3, generator=generator) - 0.1) * tip)
+        tip = (0.2 * torch.rand(count, 3, generator=generator) - 0.1) * self.tip
+        stiffer = 1 + self.stiffness * torch.randn(count, generator=generator)
+        return Push(force, 0.1 + 0.29 * place, tip, stiffer, self.robot, torch.tensor(self.tension) if self.tension else None)
 
-    def at(self, s: Tensor) -> Sections:
-        """The true sections at s under point forces."""
-        force = torch.cat([self.force, torch.zeros_like(self.place).unsqueeze(-1)], -1).unsqueeze(1)
-        return sections((PointForces(force, self.place.unsqueeze(1)),), self.tip, s)
+    @property
+    def unknowns(self) -> Unknowns:
+        """One point-like contact, the force at the tip where a cell reads it, and the stiffness where it is not quite known."""
+        loads = GaussianCoordinates(1, L, ROBOT.rod.force_scale, "point")
+        nearly = Uncertainty(stiffness=self.stiffness) if self.stiffness else None
+        return Unknowns(loads, "force" if self.tip else "none", uncertainty=nearly)
+
+    def problem(self, push: Push, seed: int | None = None) -> Problem:
+        """What these sensors read of a push, with noise (seed) or without."""
+        sensors = []
+        for i, form in enumerate(self.forms):
+            at = push.at(form.s)
+            chance = None if seed is None else torch.Generator().manual_seed(seed + 1000 * (i + 1))  # not that of the pushes
+            sensors.append(form.told(at, None if chance is None else torch.randn(form.raw(at).shape, generator=chance)))
+        tension = None if push.tension is None else push.tension.expand(len(push.place), -1)
+        return Problem(self.robot, self.unknowns, sensors, tension)
+
+    def bound(self, push: Push) -> Tensor:
+        """The Cramer-Rao bound (B, n, n) of [F_x, F_y (N), place (m), log c, tip force (N), stiffness], the last where they are
+        unknown, by differences of the forward solve.
+
+        The load is a Gaussian as wide as the estimator takes a point-like one to be, +-1 in log c; the priors of tip and stiffness
+        count as well.
+        """
+        B = len(push.place)
+        at = torch.cat(
+            [
+                push.force,
+                push.place.unsqueeze(-1),
+                torch.full((B, 1), math.log(0.5 / WIDTH**2)),
+                push.tip,
+                push.stiffer.unsqueeze(-1),
+            ],
+            -1,
+        )
+        free = [0, 1, 2, 3, *[4, 5, 6] * self.tip, *[7] * bool(self.stiffness)]
+        step = torch.tensor([1e-3, 1e-3, 1e-4, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3])
+        known = torch.tensor([0.0, 0.0, 0.0, 1.0, *[(10 * ROBOT.rod.force_scale) ** -2] * 3, 0.0])
+        if self.stiffness:
+            known[7] = self.stiffness**-2
+
+        def under(theta: Tensor, s: Tensor) -> Sections:
+            own = replace(push, force=theta[:, :2], place=theta[:, 2], tip=theta[:, 4:7], stiffer=theta[:, 7])
+            return own.spread(theta[:, 3].exp(), s)
+
+        information = torch.diag(known[free]).expand(B, -1, -1)
+        for form in self.forms:
+            dz = []
+            for k in free:
+                d = step[k] * torch.eye(8)[k]
+                dz.append((form.raw(under(at + d, form.s)) - form.raw(under(at - d, form.s))) / (2 * step[k]))
+            information = information + form.tells(torch.stack(dz), under(at, form.s))
+        return torch.linalg.inv(information)
+
+    def coverage(self, count: int, seed: int, drawn: bool = True) -> Coverage:
+        """Fits of so many pushes with noise, of which only those accepted have a say. drawn: whether there are draws."""
+        push = self.pushes(count, seed)
+        problem = self.problem(push, seed)
+        fit = estimate(problem)
+        draws = sampled_intervals(problem, fit) if drawn else None
+        C, size, ok = self.bound(push), push.force.norm(dim=-1), fit.accepted
+        along = push.force / size.unsqueeze(-1)
+        variance = {"magnitude": (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten(), "location": C[:, 2, 2]}
+
+        def judged(name: str, truth: Tensor) -> Judged:
+            found, std, normal = (getattr(fit, f"{name}{what}")[:, 0] for what in ("", "_std", "_interval"))
+            bound = variance[name].sqrt()
+
+            def held(interval: Tensor) -> float:
+                return float(((truth >= interval[:, 0]) & (truth <= interval[:, 1]))[ok].double().mean())
+
+            own = normal if draws is None else getattr(draws, name)[:, 0]
+            by_draws = held(torch.where(own.isnan(), normal, own)) if draws is not None else math.nan
+            off = (found - truth)[ok]
+            over = float((off / bound[ok]).square().mean().sqrt())
+            return Judged(float(off.square().mean().sqrt()), over, float((std / bound)[ok].mean()), held(normal), by_draws)
+
+        return Coverage(float(ok.double().mean()), judged("magnitude", size), judged("location", push.place))
 
 
-def unknowns(tip: bool) -> Unknowns:
-    """One point-like contact, and the force at the tip where a cell reads it."""
-    return Unknowns(GaussianCoordinates(1, L, ROBOT.rod.force_scale, "point"), "force" if tip else "none")
-
-
-def problem(forms: Sequence[Form], push: Push, seed: int | None = None) -> Problem:
-    """What these sensors read of a push, with noise (seed) or without."""
-    sensors = []
-    for i, form in enumerate(forms):
-        at = push.at(form.s)
-        draw = None if seed is None else torch.randn(form.raw(at).shape, generator=torch.Generator().manual_seed(seed + 1000 * i))
-        sensors.append(form.told(at, draw))
-    return Problem(ROBOT, unknowns(any(form.tip for form in forms)), sensors)
-
-
-def bound(forms: Sequence[Form], push: Push) -> Tensor:
-    """The Cramer-Rao bound (B, n, n) of [F_x, F_y (N), place (m), log c, tip force (N)], by differences of the forward solve.
-
-    The load is a Gaussian as wide as the estimator takes a point-like one to be, +-1 in log c; the tip's weak prior counts as well.
-    """
-    B = len(push.place)
-    at = torch.cat([push.force, push.place.unsqueeze(-1), torch.full((B, 1), math.log(0.5 / WIDTH**2)), push.tip], -1)
-    n = 7 if any(form.tip for form in forms) else 4
-    step = torch.tensor([1e-3, 1e-3, 1e-4, 1e-2, 1e-3, 1e-3, 1e-3])[:n]
-
-    def under(theta: Tensor, s: Tensor) -> Sections:
-        c = theta[:, 3].exp()
-        a = theta[:, :2] * (c / math.pi).sqrt().unsqueeze(-1)
-        return sections((GaussianLoads(a.unsqueeze(1), theta[:, 2:3], c.unsqueeze(-1)),), theta[:, 4:7], s)
-
-    known = [0.0, 0.0, 0.0, 1.0] + [(10 * ROBOT.rod.force_scale) ** -2] * (n - 4)
-    information = torch.diag(torch.tensor(known)).expand(B, n, n)
-    for form in forms:
-        dz = []
-        for k in range(n):
-            d = step[k] * torch.eye(7)[k]
-            dz.append((form.raw(under(at + d, form.s)) - form.raw(under(at - d, form.s))) / (2 * step[k]))
-        information = information + form.tells(torch.stack(dz), under(at, form.s))
-    return torch.linalg.inv(information)
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """accepted: a share. force (N), place (m): rms error, the same over the bound, and the share of 95 % intervals that hold."""
-
-    accepted: float
-    force: tuple[float, float, float]
-    place: tuple[float, float, float]
-
-
-def coverage(forms: Sequence[Form], count: int, seed: int) -> Coverage:
-    """Fits of so many pushes with noise, of which only those accepted have a say."""
-    push = Push.drawn(count, seed, any(form.tip for form in forms))
-    fit = estimate(problem(forms, push, seed))
-    C, size = bound(forms, push), push.force.norm(dim=-1)
-    along = push.force / size.unsqueeze(-1)
-    variances = (along.unsqueeze(1) @ C[:, :2, :2] @ along.unsqueeze(-1)).flatten(), C[:, 2, 2]
-
-    def judged(found: Tensor, truth: Tensor, interval: Tensor, variance: Tensor) -> tuple[float, float, float]:
-        ok = fit.accepted
-        error = (found - truth)[ok].square().mean().sqrt()
-        held = (truth > interval[:, 0]) & (truth < interval[:, 1])
-        return float(error), float(((found - truth).square() / variance)[ok].mean().sqrt()), float(held[ok].double().mean())
-
-    force = judged(fit.magnitude[:, 0], size, fit.magnitude_interval[:, 0], variances[0])
-    place = judged(fit.location[:, 0], push.place, fit.location_interval[:, 0], variances[1])
-    return Coverage(float(fit.accepted.double().mean()), force, place)
+CASES: dict[str, Callable[[], Case]] = {
+    "20 markers, 1 mm": lambda: Case((markers(),)),
+    "20 markers, 0.5 to 3 mm": lambda: Case((own_noise(),)),
+    "20 markers, 1 mm, 5 mm in depth": lambda: Case((stereo(),)),
+    "20 markers, 0.3 mm, s off by 2 mm": lambda: Case((uncertain_s(),)),
+    "5 poses, 0.5 mm, 0.5 degrees": lambda: Case((poses(),)),
+    "10 directions, 0.5 degrees": lambda: Case((directions(),)),
+    "5 directions, 0.5 degrees, with positions, 0.5 mm": lambda: Case((directions(True),)),
+    "20 gratings, 0.05 1/m": lambda: Case((curvature(),)),
+    "20 gratings of 4 cores, 15 microstrain": lambda: Case((core_strains(),)),
+    "base wrench, 20 mN, 2 mN m": lambda: Case((base_wrench(),)),
+    "centre line, 60 points, 1 mm": lambda: Case((centre_line(),)),
+    "centre line, ordered": lambda: Case((centre_line(ordered=True),)),
+    "one camera, 0.3 px": lambda: Case((camera(),)),
+    "two cameras, 0.3 px": lambda: Case((camera(), camera(OTHER_EYE))),
+    "20 gratings and a tip pose": lambda: Case((curvature(), poses(MANY[-1:]))),
+    "5 markers, base wrench, tip wrench": lambda: Case((markers(FEW), base_wrench(), tip_wrench())),
+    "one camera and the gratings": lambda: Case((camera(), curvature())),
+    "centre line and 5 directions": lambda: Case((centre_line(), directions(True))),
+    "one camera and the gratings, stiffness known to 3 %": lambda: Case((camera(), curvature()), stiffness=0.03),
+    "20 markers and base wrench, stiffness known to 10 %": lambda: Case((markers(), base_wrench()), stiffness=0.1),
+    "20 gratings of 4 cores, two tendons that rub": lambda: Case((core_strains(),), Robot(ROBOT.rod, RUBBING), (3.0, 1.0)),
+}

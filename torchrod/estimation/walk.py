@@ -86,14 +86,16 @@ class Walk:
 
     def states(
         self, x: Float[Tensor, "B n"], slopes: bool
-    ) -> tuple[Float[Tensor, "B P1 13"], Float[Tensor, "B 6"], Float[Tensor, "B P1 13 n"] | None, Float[Tensor, "B 6 n"] | None]:
-        """The section's states [p (m), q, wrench (N, N m)] at problem.s and at the tip, in the rod's own frame, the tip residual c
-        (N, N m), and where slopes are wanted how they move with x.
+    ) -> tuple[Float[Tensor, "B P1 w"], Float[Tensor, "B 6"], Float[Tensor, "B P1 w n"] | None, Float[Tensor, "B 6 n"] | None]:
+        """The section's states [p (m), q, wrench (N, N m)] at problem.s and at the tip, in the rod's own frame, with Theta of every
+        tendon where they rub; the tip residual c (N, N m), and where slopes are wanted how they move with x.
         """
+        tendons = self.problem.robot.tendons
+        width = kernel.STATE + (0 if tendons.friction is None else len(tendons))
         t = self.tables(x)  # which must outlive the call: the structure holds bare addresses
-        h, H = kernel.measured_now(x, t.structure, t.markers, slopes, states=True)
-        y, c = h[:, :-TIP_ROWS].unflatten(1, (-1, kernel.STATE)), h[:, -TIP_ROWS:]
-        return (y, c, None, None) if H is None else (y, c, H[:, :-TIP_ROWS].unflatten(1, (-1, kernel.STATE)), H[:, -TIP_ROWS:])
+        h, H = kernel.measured_now(x, t.structure, t.markers, slopes, width)
+        y, c = h[:, :-TIP_ROWS].unflatten(1, (-1, width)), h[:, -TIP_ROWS:]
+        return (y, c, None, None) if H is None else (y, c, H[:, :-TIP_ROWS].unflatten(1, (-1, width)), H[:, -TIP_ROWS:])
 
     def balance(
         self, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float

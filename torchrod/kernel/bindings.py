@@ -385,13 +385,15 @@ def normal_equations_now(x: Float[Tensor, "B n"], task: CTask, P: int) -> Sums:
 
 
 def measured_now(
-    x: Float[Tensor, "B n"], task: CTask, P: int, slopes: bool, states: bool = False
+    x: Float[Tensor, "B n"], task: CTask, P: int, slopes: bool, width: int = 0
 ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"] | None]:
-    """h(x) and, where slopes are wanted, dh/dx; with `states`, instead of the markers' rows, STATE for each place and the tip."""
+    """h(x) and, where slopes are wanted, dh/dx; with a `width`, instead of the markers' rows, the section's state of as many
+    numbers (STATE, then Theta of every tendon where they rub) at each place and at the tip.
+    """
     (B, n), x = x.shape, x.contiguous()
-    Z = (STATE * (P + 1) if states else 3 * P) + 6
+    Z = (width * (P + 1) if width else 3 * P) + 6
     h, H = x.new_empty(B, Z), x.new_empty(B, Z, n) if slopes else None
-    _run("torchrod_measure", B, ctypes.byref(task), _pointer(x, "x"), B, int(states), _pointer(h, "h"), _pointer(H, "H"))
+    _run("torchrod_measure", B, ctypes.byref(task), _pointer(x, "x"), B, int(width > 0), _pointer(h, "h"), _pointer(H, "H"))
     return h, H
 
 

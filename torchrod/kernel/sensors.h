@@ -139,12 +139,13 @@ template <class X> struct Show {
     }
     // The section's own state, of which torch works out what other sensors read.
     void state(int64_t p, Mask here) const {
-        for (int c = 0; c < STATE; c++) {
-            const int64_t z = STATE * p + c;
+        const int64_t width = f.known.width();
+        for (int64_t c = 0; c < width; c++) {
+            const int64_t z = width * p + c;
             to.h(z) = select(here, y[c], to.h(z));
             for (int64_t j = 0; j < g.tangents; j++) {
                 V& at = to.H(z)[column(j)];
-                at = select(here, dy[j * f.known.width() + c], at);
+                at = select(here, dy[j * width + c], at);
             }
         }
     }
@@ -179,7 +180,7 @@ template <class X> struct Show {
 
 // How many rows there are: three for each marker, or the states at every output and at the tip, and c.
 inline int64_t rows_of(const Task& f, bool states) {
-    return (states ? STATE * f.known.outputs : 3 * (f.known.outputs - 1)) + PLAIN;
+    return (states ? f.known.width() * f.known.outputs : 3 * (f.known.outputs - 1)) + PLAIN;
 }
 
 // h and H of the samples in the lanes. x(j): entry j of their states. Without `slopes` h alone. states: instead of the markers, the

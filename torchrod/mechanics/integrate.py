@@ -23,7 +23,7 @@ def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bo
 
     Where tendons rub, y may have Theta of every one behind it, as the answer then has; else they have not turned so far.
     """
-    width, y = y.shape[-1], with_turning(y, table)
+    width, y = y.shape[-1], with_theta(y, table)
     h, states = grid.h, [y]
     steps = range(h.shape[-1])
     table = table.reversed() if reverse else table
@@ -33,7 +33,7 @@ def march(section: Section, y: State, table: StageTable, grid: Grid, reverse: bo
     return torch.stack(states[::-1] if reverse else states, -2)[..., :width]
 
 
-def with_turning(y: Float[Tensor, "... c"], table: StageTable) -> Float[Tensor, "... d"]:
+def with_theta(y: Float[Tensor, "... c"], table: StageTable) -> Float[Tensor, "... d"]:
     """y with zeros for what the tendons have turned, where they rub and it says nothing of it."""
     rubbing = 0 if table.tendons is None or table.tendons.friction is None else table.tendons.tau.shape[-1]
     return torch.nn.functional.pad(y, (0, STATE + rubbing - y.shape[-1]))
@@ -95,7 +95,7 @@ def march_linearized(
     The nodes stay where they are. Tangent k moves the first state by dy0[..., k] and, where k < g, the local load integrals
     [G, G2] by dlocal[..., k].
     """
-    width, y0, dy0 = y0.shape[-1], with_turning(y0, table), with_turning(dy0.mT, table).mT
+    width, y0, dy0 = y0.shape[-1], with_theta(y0, table), with_theta(dy0.mT, table).mT
     if compiled(section, y0):
         tensors, numbers = known(section, table, grid, keep)
         local = None if (G := table.loads.G) is None or (G2 := table.loads.G2) is None else torch.cat([G, G2], -1)

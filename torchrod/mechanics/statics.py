@@ -20,7 +20,7 @@ from ..util.errors import InputError
 from ..util.precision import as_float64
 from ..util.status import Status
 from .grid import DEFAULT_STEPS, Grid, Places, make_grid, on_rod
-from .integrate import march, march_linearized, states_at
+from .integrate import march, march_linearized, states_at, with_theta
 from .lie import Quaternion, Vector, cross, identity_quaternion, inverse3, logarithm, matvec, rotate, turned
 from .loads import Load, LoadIntegrals, taken, total
 from .robot import Robot
@@ -99,7 +99,8 @@ class Shape:
     """The rod at the outputs: p (..., P, 3) m, q (..., P, 4), and the tip residual c (..., 6) [N, N m], section frame.
 
     q: the section's orientation in the base frame, unit quaternions (x, y, z, w). p: base frame. tip_q: (..., 4), the orientation
-    of the last section. wrench: (..., P, 6), [N~ (N), M~ (N m)] of mechanics.section (1).
+    of the last section. wrench: (..., P, 6), [N~ (N), M~ (N m)] of mechanics.section (1). turned: (..., P, T) rad, Theta of every
+    tendon where they rub, else of none.
     """
 
     p: Float[Tensor, "... P 3"]
@@ -107,16 +108,18 @@ class Shape:
     tip_residual: Float[Tensor, "... 6"]
     tip_q: Float[Tensor, "... 4"]
     wrench: Float[Tensor, "... P 6"]
+    turned: Float[Tensor, "... P T"]
 
 
-def shape_of(section: Section, states: Float[Tensor, "... P1 13"], beyond: LoadIntegrals) -> Shape:
+def shape_of(section: Section, states: Float[Tensor, "... P1 w"], beyond: LoadIntegrals) -> Shape:
     """The shape at the first P states; the tip residual (17) from the last, the wrench carried just beyond the tip:
 
     c = [N~ - G, M~ + e3 x G2 - Gm] at s = L+, zero in equilibrium
     """
     p, q, N, M = states[..., :STATE].split(STATE_PARTS, -1)
     c = section_wrench(q[..., -1, :], N[..., -1, :], M[..., -1, :], section.e3, beyond)
-    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :], states[..., :-1, 7:])
+    wrench, turned = states[..., :-1, 7:STATE], states[..., :-1, STATE:]
+    return Shape(p[..., :-1, :], q[..., :-1, :], torch.cat(c, -1), q[..., -1, :], wrench, turned)
 
 
 def shape_from_base(
@@ -136,7 +139,7 @@ def shape_from_base(
     grid = grid_for(robot, loads, outputs, steps)
     table = stage_table(robot, loads, tension, grid)
     section = Section.of(robot.rod.K_se, robot.rod.K_bt)
-    y, at = base_state(robot, alpha, table), grid.outputs_and_tip
+    y, at = with_theta(base_state(robot, alpha, table), table), grid.outputs_and_tip
     if differentiable:
         states = states_at(march(section, y, table, grid), at)
     else:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..mechanics.grid import DEFAULT_STEPS, Places, on_rod
-from ..mechanics.integrate import march_linearized
+from ..mechanics.integrate import march_linearized, with_theta
 from ..mechanics.jacobian import forward_jacobian, moved_along
 from ..mechanics.lie import Matrix, Vector, conjugate, exponential, move, product, unrotate
 from ..mechanics.loads import LoadIntegrals, total
@@ -366,12 +366,11 @@ class Problem(Float64):
         H, _ = near_zero(H, (one for _, one in off), theta, self.wide)
         return h, torch.cat([H[..., :at], torch.stack(slopes, -1), H[..., at:]], -1)
 
-    def read(self, states: Float[Tensor, "B P1 13"], x: Float[Tensor, "B n"]) -> Float[Tensor, "B rows"]:
+    def read(self, states: Float[Tensor, "B P1 w"], x: Float[Tensor, "B n"]) -> Float[Tensor, "B rows"]:
         """What the sensors read of a section's states [p (m), q, wrench (N, N m)] at their arc lengths and at the tip, in its own
-        frame.
+        frame; with Theta (rad) of every tendon where they rub.
         """
-        p, q, wrench = states.split([3, 4, 6], -1)
-        return self._rows(p[..., :-1, :], q[..., :-1, :], wrench[..., :-1, :], q[..., -1, :], x)
+        return self._rows(states[..., :-1, :], states[..., -1, 3:7], x)
 
     def _read(self, shape: Shape, x: Float[Tensor, "... n"]) -> Float[Tensor, "... z"]:
         """What the sensors read of a shape, and c."""
@@ -379,17 +378,13 @@ class Problem(Float64):
         if self.state.tip.size:
             tip = self.state.tip_wrench(x)
             c = c - unrotate(shape.tip_q.unsqueeze(-2), tip.unflatten(-1, (2, 3))).flatten(-2)
-        return torch.cat([self._rows(shape.p, shape.q, shape.wrench, shape.tip_q, x), c], -1)
+        own = torch.cat([shape.p, shape.q, shape.wrench, shape.turned], -1)
+        return torch.cat([self._rows(own, shape.tip_q, x), c], -1)
 
     def _rows(
-        self,
-        p: Float[Tensor, "... P 3"],
-        q: Float[Tensor, "... P 4"],
-        wrench: Float[Tensor, "... P 6"],
-        tip_q: Float[Tensor, "... 4"],
-        x: Float[Tensor, "... n"],
+        self, own: Float[Tensor, "... P w"], tip_q: Float[Tensor, "... 4"], x: Float[Tensor, "... n"]
     ) -> Float[Tensor, "... rows"]:
-        state, own = self.state, torch.cat([p, q, wrench[..., :6]], -1)
+        state, p, q = self.state, own[..., :3], own[..., 3:7]
         if state.registration.size:
             zeta = state.registration.of(x)
             p, q = move(zeta, p), product(exponential(zeta[..., 3:]).unsqueeze(-2), q)
@@ -403,14 +398,9 @@ class Problem(Float64):
             first = at.stop
         return torch.cat(rows, -1)
 
-    def _strains(self, y: Float[Tensor, "... P 13"], x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
+    def _strains(self, y: Float[Tensor, "... P w"], x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
         """v (-) and u (1/m) at the arc lengths `at` of all sensors', from the rates of mechanics.section at the states y."""
         loads, robot = self.unknowns.loads.loads(x[..., self.state.loads.at]), self.robot
-        if robot.tendons.friction is not None:
-            raise ValueError(
-                "curvatures, strains and uncertain arc lengths are not worked out where tendons rub; remove friction from "
-                "[[tendons]], or leave those readings out"
-            )
         table = stage_table(self.as_pulled, loads, self.pulling(x), Places(self.s[at])).stage(0)
         q = y[..., 3:7]
         rate = derivative(Section.of(robot.rod.K_se, robot.rod.K_bt), y, table)
@@ -446,9 +436,9 @@ class Problem(Float64):
         G, dG = value[:, :-6].reshape(B, S, 3, 6), slope[:, :-6].reshape(B, S, 3, 6, g)
         known = stage_table(self.robot, (), self.tension, grid)
         table = replace(known, loads=known.loads + LoadIntegrals(G[..., :3], G[..., 3:]))
-        dy0 = x.new_zeros(B, 13, g + 6)
+        y0 = with_theta(base_state(self.robot, alpha, table), table)
+        dy0 = x.new_zeros(*y0.shape, g + 6)
         dy0[:, range(7, 13), range(g, g + 6)] = state.base.unit
-        y0 = base_state(self.robot, alpha, table)
         section = Section.of(self.robot.rod.K_se, self.robot.rod.K_bt)
         states, tangents = march_linearized(section, y0, dy0, table, dG, grid, grid.outputs_and_tip)
         return self._after(section, states, tangents, value[:, -6:], slope[:, -6:], x)
@@ -456,8 +446,8 @@ class Problem(Float64):
     def _after(
         self,
         section: Section,
-        states: Float[Tensor, "B P1 13"],
-        tangents: Float[Tensor, "B P1 13 m"],
+        states: Float[Tensor, "B P1 w"],
+        tangents: Float[Tensor, "B P1 w m"],
         beyond: Float[Tensor, "B 6"],
         dbeyond: Float[Tensor, "B 6 g"],
         x: Float[Tensor, "B n"],
