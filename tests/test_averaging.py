@@ -3,6 +3,7 @@
 import json
 import math
 
+import pytest
 import torch
 
 from tests.robots import T, steel_rod
@@ -50,6 +51,7 @@ def test_probabilities_are_those_of_the_evidence():
     assert int(((p[:, 1] > 0.1) & (p[:, 1] < 0.9)).sum()) >= 2  # of some it is open
 
 
+@pytest.mark.study
 def test_a_resultant_holds_what_was_merged():
     """Two pushes 6 % of the length apart, which now and then are told as one: once 0 to 23 % of their resultants, then 79."""
     problem, truth = posed(24, 2, (0.5, 2.0), gap=0.06 * L)
@@ -91,6 +93,7 @@ def test_close_explanations_are_told(tmp_path, capsys):
     assert "nearly alike" in capsys.readouterr().out
 
 
+@pytest.mark.study
 def test_a_band_of_any_form_holds_a_uniform_load():
     """Over 30 or 60 % of the rod, of 100 point forces; a Gaussian's band holds a quarter of it.
 

@@ -39,12 +39,12 @@ from torchrod.estimation.solve import linearize
     [(0.0, 1e-4, "point", 0.1, 0.001), (1e-3, 1e-3, "point", 5.5, 0.05), (1e-3, 1e-3, "contact", 5.5, 0.05)],
 )
 def test_study_1(noise, sigma, prior, millimetres, newtons):
-    """Every case converges and is accepted, within ten iterations in the mean, well within the paper's errors."""
+    """Every case converges and is accepted, in 7.2 iterations in the mean (7.6 with NEAR = 1), well within the paper's errors."""
     study = study1(100)
     fit = study.estimate(noise, prior, sigma)
     assert (fit.status == Status.CONVERGED).all()
     assert fit.accepted.all()
-    assert fit.iterations.double().mean() <= 10
+    assert fit.iterations.double().mean() <= 7.5
     assert (fit.location[:, 0] - study.location).abs().mean() <= millimetres * 1e-3
     assert (fit.force[:, 0] - study.force).norm(dim=-1).mean() <= 2 * newtons
     assert (fit.magnitude[:, 0] - study.force.norm(dim=-1)).abs().mean() <= newtons

@@ -318,6 +318,7 @@ def test_the_spread_is_the_cramer_rao_bound(name):
         assert ((tip / C[:, 4:7, 4:7].diagonal(dim1=-2, dim2=-1)).sqrt() - 1).abs().max() < 0.05
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["20 markers, 0.3 mm, s off by 2 mm", "20 gratings, 0.05 1/m"])
 def test_the_intervals_hold_the_truth(name):
     """`test_coverage` and scripts/sensors.py have all of them, and 500 cases each."""

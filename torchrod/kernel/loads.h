@@ -1,4 +1,5 @@
-// Integrals of the loads and how they move with gamma: the compiled copy of torchrod/mechanics/loads.py under torchrod/coordinates.
+// Integrals of the loads and how they move with gamma: the compiled copy of torchrod/mechanics/loads.py under the unknowns of
+// torchrod/model/load_families.
 #pragma once
 
 #include "march.h"

@@ -1,6 +1,6 @@
-// The hidden layers of a multilayer perceptron with GELU: the compiled copy of network.py, Network.hidden, in single precision, which
-// is what the weights were learned in and more than a guess needs. A block of samples goes through each layer together, so that
-// the weights, which do not fit beside them in the cache, are read once for the block.
+// The hidden layers of a multilayer perceptron with GELU: the compiled copy of Network.hidden in torchrod/learned/network.py, in single
+// precision, which is what the weights were learned in and more than a guess needs. A block of samples goes through each layer
+// together, so that the weights, which do not fit beside them in the cache, are read once for the block.
 #pragma once
 
 #include <vector>
