@@ -31,6 +31,7 @@ from ..model.unknowns import Registration, Unknowns
 from ..util.status import Status
 from .alternatives import Solution
 from .count import free_parameters
+from .suspects import suspected
 
 Cycle = tuple[int, ...]
 MOST_EXCHANGES = 3
@@ -45,6 +46,7 @@ HUGE = 5.0  # or larger than so many force scales, where the prior begins to hol
 ITERATIONS = 60
 ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
+MOST_SUSPECTED = 40  # samples for which it is asked what is off of the robot
 MOST_TOLD = 2  # other solutions in a message; the result file has them all
 ONE_PLACE = (
     "All was read at s = {:.4g} mm, where one contact looks like another; for a force at the tip, try --contacts 0 "
@@ -64,6 +66,7 @@ class Diagnosis:
     a large opposite couple, which no contact is; NaN where there is none. tip_instead (B,): where a force at the tip explains the
     shape with fewer contacts than without it. others: per sample what else explains its readings; () where nothing was looked for.
     rivals: per sample a word on a hypothesis that is nearly as probable as the one that was chosen; () without probabilities.
+    robot: per sample what of the robot, or of the arc lengths, would explain the readings if it were off, or nothing.
     """
 
     s: Float[Tensor, " P"]
@@ -76,6 +79,7 @@ class Diagnosis:
     tip_instead: Bool[Tensor, " B"]
     others: tuple[tuple[Solution, ...], ...] = ()
     rivals: tuple[str, ...] = ()
+    robot: tuple[str, ...] = ()
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
         """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
@@ -91,8 +95,8 @@ class Diagnosis:
     def told(self) -> list[bool]:
         """Of which samples there is something to say."""
         doubt = torch.isfinite(self.registration).all(-1) | self.one_more | torch.isfinite(self.couple) | self.tip_instead
-        others, rivals = self.others or [()] * len(doubt), self.rivals or [""] * len(doubt)
-        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others, rivals)
+        others, rivals, robot = (kind or [()] * len(doubt) for kind in (self.others, self.rivals, self.robot))
+        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others, rivals, robot)
         return [any(parts) for parts in zip(*by_kind, strict=True)]
 
     def message(self, sample: int) -> str:
@@ -111,6 +115,8 @@ class Diagnosis:
                 f"The residual near the base looks like a registration error of about {shift:.2g} mm and {turn:.2g} degrees; "
                 "try --registration."
             )
+        if self.robot and self.robot[sample]:
+            said.append(f"What explains the readings best is {self.robot[sample]}.")
         if bool(torch.isfinite(self.couple[sample])):
             said.append(
                 f"The shape asks for something that is not a contact near s = {1e3 * float(self.couple[sample]):.3g} mm: two large "
@@ -252,10 +258,10 @@ def couples(fit: Estimate, rod: Rod) -> Float[Tensor, " B"]:
 
 
 def _explained(
-    problem: Problem, own: Float[Tensor, " b"], settings: Settings
-) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"], Float[Tensor, " b"]]:
-    """An error of the base frame, or that one more load, explains the markers: of the two and the fit (its score: own) the best.
-    Last, where (m) one more load only makes a couple: that explains nothing.
+    problem: Problem, x: Float[Tensor, "b n"], own: Float[Tensor, " b"], wanted: Bool[Tensor, " b"], settings: Settings
+) -> tuple[Float[Tensor, "b 6"], Bool[Tensor, " b"], Float[Tensor, " b"], list[str]]:
+    """An error of the base frame, or that one more load, or what is off of the robot, explains the readings: of these and the fit
+    x (its score: own) the best. Third, where (m) one more load only makes a couple: that explains nothing.
 
     A fit that is accepted, for which own is finite, may still have loads that a base frame with fewer would do without.
     """
@@ -283,10 +289,16 @@ def _explained(
         fit = estimate_each(part, settings)
         couple[refused] = torch.where(fit.accepted, couples(fit, problem.robot.rod), torch.nan)
         by_load[refused] = _score(part, fit.accepted & couple[refused].isnan(), fit.chi2)
-    best = torch.minimum(by_frame, torch.minimum(by_load, own - SURE))
+    by_robot, robot = torch.full_like(own, torch.inf), [""] * len(own)
+    asked = refused[wanted[refused]]
+    off = suspected(problem.take(asked), x[asked], settings)
+    by_robot[asked] = off.score
+    best = torch.stack([by_frame, by_load, by_robot, own - SURE]).amin(0)
+    for b, said in zip(asked.tolist(), off.said, strict=True):
+        robot[b] = said if bool(by_robot[b] == best[b]) else ""
     framed = torch.isfinite(best) & (by_frame == best)
     one_more = torch.isfinite(best) & ~framed & (by_load == best)
-    return torch.where(framed.unsqueeze(-1), zeta, torch.nan), one_more, couple
+    return torch.where(framed.unsqueeze(-1), zeta, torch.nan), one_more, couple, robot
 
 
 def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
@@ -320,6 +332,7 @@ def diagnose(
     registration, one_more = torch.full((B, 6), torch.nan, dtype=torch.float64), torch.zeros(B, dtype=torch.bool)
     geometry = [""] * B
     outliers: list[Cycle] = [()] * B
+    robot = [""] * B
     markers, L = problem.markers, problem.robot.rod.length
     couple = torch.where(fit.status == int(Status.CONVERGED), couples(fit, problem.robot.rod), torch.nan)
     tip_instead = torch.zeros(B, dtype=torch.bool)
@@ -335,6 +348,9 @@ def diagnose(
         geometry[b] = misplaced_at(b)
     determined = [own for own in (problem.of(unknowns) for unknowns, _ in parts) if own.determined]
     richest = max(reversed(determined), key=lambda own: own.state.loads.size)
+    wanted = torch.zeros(B, dtype=torch.bool)  # a robot that is off is so in all samples
+    refused_at = (~fit.accepted & torch.isfinite(fit.chi2)).nonzero().squeeze(-1)
+    wanted[refused_at[torch.linspace(0, len(refused_at) - 1, min(MOST_SUSPECTED, len(refused_at))).round().long()]] = True
     for unknowns, index in parts:
         own = problem.of(unknowns)
         tip_instead[index] = len(parts) > 1 and unknowns.tip != "none" and problem.unknowns.tip == "none"
@@ -349,9 +365,14 @@ def diagnose(
                 geometry[b] = misplaced_at(b)
             rest = rows[[not (exchanged[b] or geometry[b]) for b in rows.tolist()]]
             part = own.take(rest)
-            registration[rest], one_more[rest], pair = _explained(part, _score(part, fit.accepted[rest], fit.chi2[rest]), hasty)
+            score = _score(part, fit.accepted[rest], fit.chi2[rest])
+            registration[rest], one_more[rest], pair, off = _explained(part, fit.x[rest, : own.size], score, wanted[rest], hasty)
+            for b, said in zip(rest.tolist(), off, strict=True):
+                robot[b] = said
             couple[rest] = torch.where(couple[rest].isnan(), pair, couple[rest])
             rest = rest[~fit.accepted[rest] & ~one_more[rest] & registration[rest].isnan().any(-1)]
-            for b, off in zip(rest.tolist(), _outliers(richest.take(rest), settings or Settings()), strict=True):
-                outliers[b] = off
-    return Diagnosis(problem.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers), couple, tip_instead)
+            rest = rest[[not robot[b] for b in rest.tolist()]]
+            for b, some in zip(rest.tolist(), _outliers(richest.take(rest), settings or Settings()), strict=True):
+                outliers[b] = some
+    found = registration, one_more, tuple(geometry), tuple(outliers), couple, tip_instead
+    return Diagnosis(problem.s, tuple(exchanged), *found, robot=tuple(robot))

@@ -130,7 +130,7 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
     exchanged: list[tuple[tuple[int, ...], ...]] = [()] * B
     geometry, outliers = [""] * B, [()] * B
     others: list[tuple[Solution, ...]] = [()] * B
-    rivals = [""] * B
+    rivals, robot = [""] * B, [""] * B
     for part, pattern in zip(parts, found, strict=True):
         at = pattern.places.tolist()
         for k, b in enumerate(pattern.samples.tolist()):
@@ -139,6 +139,7 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
             geometry[b] = part.geometry[k]
             others[b] = part.others[k] if part.others else ()
             rivals[b] = part.rivals[k] if part.rivals else ""
+            robot[b] = part.robot[k] if part.robot else ""
     return Diagnosis(
         problem.s,
         tuple(exchanged),
@@ -150,4 +151,5 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
         instead,
         tuple(others),
         tuple(rivals),
+        tuple(robot),
     )

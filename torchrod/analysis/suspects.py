@@ -1,0 +1,135 @@
+"""What a robot that is not as its file says would explain: readings that no load explains are fitted again with one parameter of
+the robot, or the arc lengths, unknown, each by itself.
+
+Which of them explains a sample best is told by the marginal likelihood, by Laplace's method: of parameters theta with priors
+
+    (1)  -2 log p = cost + log det (posterior precision / prior precision of theta),
+
+beside chi^2 + k ln(n) for what has no prior, as analysis.count has it. Arc lengths are no parameters but noise along the rod (a =
+s_std / noise), for which -2 log p has ln(1 + a^2) of every marker. A parameter that a load can stand for, as a stiffness that is
+off for a larger force, is not seen by its residual, and is not told here.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..estimation.result import Estimate
+from ..estimation.solve import Settings, solver_of
+from ..estimation.starts import Origin, Start
+from ..model.problem import Problem
+from ..model.uncertainty import Uncertainty
+from .count import free_parameters
+
+ITERATIONS = 25  # of a fit that begins at that of the robot as it is
+ALIKE = 4.0  # of -2 log p: what is behind by less is told as well
+ARC_LENGTH = 0.01  # of the length: by how much arc lengths may be off
+UNDER = "state it under [uncertainty], or calibrate the robot"
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A parameter of the robot that may be off: its deviation, what is said of its errors, and the remedy."""
+
+    stated: Uncertainty
+    said: Callable[[list[float]], str]
+    remedy: str = UNDER
+
+
+def _share(what: str) -> Callable[[list[float]], str]:
+    return lambda errors: f"{what} off by {', '.join(f'{100 * e:+.2g} %' for e in errors)}"
+
+
+def _size(what: str, unit: str, scale: float = 1.0) -> Callable[[list[float]], str]:
+    return lambda errors: f"{what} by {scale * math.hypot(*errors):.2g} {unit}"
+
+
+def suspects(problem: Problem) -> list[Suspect]:
+    """What may be off of a robot, by as much as such robots are; nothing where its uncertainty is stated already."""
+    robot, unknowns = problem.robot, problem.unknowns
+    if unknowns.uncertainty is not None or unknowns.tension_std is not None:
+        return []
+    L = robot.rod.length
+    found = [
+        Suspect(Uncertainty(stiffness=0.1), _share("a stiffness that is")),
+        Suspect(Uncertainty(set=0.1 / L), _size("a rod that is bent, unloaded, other than its file says,", "1/m")),
+        Suspect(Uncertainty(oval=0.1), _size("a section that is stiffer to one side", "%", 100)),
+    ]
+    if problem.tension is not None:
+        found += [
+            Suspect(Uncertainty(tension=0.1), _share("tensions that are")),
+            Suspect(Uncertainty(friction=0.2), _size("tendons that rub, mu times their motion", "in all")),
+        ]
+    if not robot.weightless:
+        found += [
+            Suspect(Uncertainty(mass=0.2), _share("a mass that is")),
+            Suspect(Uncertainty(gravity=math.radians(10)), _size("gravity that is turned", "degrees", math.degrees(1))),
+        ]
+    return found
+
+
+@dataclass(frozen=True)
+class Suspected:
+    """Of b samples the suspect that explains them best: -2 log p up to what all explanations share, inf where none does; words."""
+
+    score: Float[Tensor, " b"]
+    said: list[str]
+
+
+def suspected(problem: Problem, x: Float[Tensor, "b n"], settings: Settings) -> Suspected:
+    """Try all of them on every sample, from its fit x. Those that explain it nearly as well as the best are told, too."""
+    solve = solver_of(replace(settings, restarts=(), basins=0, sized=False, max_iterations=ITERATIONS))
+    B, scores, words = problem.batch, [torch.full((problem.batch,), torch.inf, dtype=torch.float64)], [[""] * problem.batch]
+    remedies = [""]
+    for suspect in suspects(problem) if B else []:
+        own = problem.of(replace(problem.unknowns, uncertainty=suspect.stated))
+        if not (own.state.parameters.size and own.determined):
+            continue
+        at = own.state.parameters.at.start
+        start = torch.cat([x[:, :at], x.new_zeros(B, own.state.parameters.size), x[:, at:]], -1)
+        fit = solve(own, Start.at(start, Origin.OTHER_FIT))
+        assert fit.parameters is not None
+        scores.append(_score(own, fit, _narrowed(own, fit)))
+        words.append([suspect.said(errors) for errors in fit.parameters.tolist()])
+        remedies.append(suspect.remedy)
+    if B and (along := _along(problem)) is not None:
+        own, price = along
+        scores.append(_score(own, solve(own, Start.at(x, Origin.OTHER_FIT)), price))
+        words.append(["arc lengths that are off along the rod"] * B)
+        remedies.append("measure them again, or state how well they are known (s_std)")
+    every = torch.stack(scores)
+    best, which = every.min(0)
+    said = [""] * B
+    for b in torch.isfinite(best).nonzero().squeeze(-1).tolist():
+        near = [k for k in every[:, b].argsort().tolist() if every[k, b] < best[b] + ALIKE]
+        said[b] = f"{', or as well '.join(words[k][b] for k in near)}; {remedies[int(which[b])]}"
+    return Suspected(best, said)
+
+
+def _score(own: Problem, fit: Estimate, price: Float[Tensor, " b"] | float) -> Float[Tensor, " b"]:
+    """-2 log p, inf where the fit is not accepted. price: what is to be paid for what is not a load."""
+    by_loads = free_parameters(own) * torch.log(own.seen.clamp(min=3).to(fit.chi2.dtype))
+    return torch.where(fit.accepted, fit.chi2 + by_loads + price, torch.inf)
+
+
+def _narrowed(own: Problem, fit: Estimate) -> Float[Tensor, " b"]:
+    """The last term of (1)."""
+    block = own.state.parameters
+    root = block.precision.sqrt()
+    C = fit.covariance[:, block.at, block.at]
+    return -torch.linalg.slogdet(root.unsqueeze(-1) * C * root)[1].nan_to_num(-math.inf)
+
+
+def _along(problem: Problem) -> tuple[Problem, float] | None:
+    """The problem with arc lengths that are not well known, and what that costs before the data (module)."""
+    markers = problem.markers
+    if markers is None or markers.s_std is not None or not markers.isotropic or isinstance(markers.noise, Tensor):
+        return None
+    off = ARC_LENGTH * problem.robot.rod.length
+    own = replace(markers, s_std=torch.full_like(markers.s, off))
+    price = len(markers.s) * math.log1p((off / float(markers.noise)) ** 2)
+    return replace(problem, sensors=[own if s is markers else s for s in problem.sensors]), price
