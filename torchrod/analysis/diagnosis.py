@@ -1,4 +1,6 @@
-"""Why does a fit not explain its markers? Labels exchanged, a base frame off, a load too few, the unit, outliers. It only tells.
+"""Why does a fit not explain its markers? Labels exchanged, a base frame off, a load too few, the unit, outliers, arc lengths.
+
+It only tells.
 
 A rod of arc length s_j - s_i between two markers holds them no farther apart than that, whatever bends it (r: their offsets from
 the centre line):
@@ -22,6 +24,7 @@ from torch import Tensor
 
 from ..estimation.result import Estimate
 from ..estimation.solve import Settings, estimate_each
+from ..mechanics.lie import rotate
 from ..mechanics.rod import Rod
 from ..model.load_families import GaussianCoordinates
 from ..model.marker_geometry import misplaced
@@ -45,6 +48,7 @@ HUGE = 5.0  # or larger than so many force scales, where the prior begins to hol
 ITERATIONS = 60
 ROBUST = 10.0  # degrees of freedom of Student's t: under 3 % more error on clean markers (docs/model.md)
 FEW, CLEAR = 0.2, 8.0  # outliers are told where they are at most this share of the markers, and so many sigma off at least
+SLIP = 0.05  # of the length: arc lengths that are farther off than that are another mistake
 MOST_TOLD = 2  # other solutions in a message; the result file has them all
 ONE_PLACE = (
     "All was read at s = {:.4g} mm, where one contact looks like another; for a force at the tip, try --contacts 0 "
@@ -64,6 +68,7 @@ class Diagnosis:
     a large opposite couple, which no contact is; NaN where there is none. tip_instead (B,): where a force at the tip explains the
     shape with fewer contacts than without it. others: per sample what else explains its readings; () where nothing was looked for.
     rivals: per sample a word on a hypothesis that is nearly as probable as the one that was chosen; () without probabilities.
+    slip: (B,) m, a standard deviation of the arc lengths that explains the markers; NaN where none does, () where not looked for.
     """
 
     s: Float[Tensor, " P"]
@@ -76,6 +81,7 @@ class Diagnosis:
     tip_instead: Bool[Tensor, " B"]
     others: tuple[tuple[Solution, ...], ...] = ()
     rivals: tuple[str, ...] = ()
+    slip: tuple[float, ...] = ()
 
     def suspects(self, sample: int) -> list[dict[str, object]]:
         """For files: groups of markers, counted from 1 along the rod, their arc lengths (m), and what they are suspected of."""
@@ -92,7 +98,8 @@ class Diagnosis:
         """Of which samples there is something to say."""
         doubt = torch.isfinite(self.registration).all(-1) | self.one_more | torch.isfinite(self.couple) | self.tip_instead
         others, rivals = self.others or [()] * len(doubt), self.rivals or [""] * len(doubt)
-        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others, rivals)
+        slips = [math.isfinite(slip) for slip in self.slip] or [False] * len(doubt)
+        by_kind = (doubt.tolist(), self.exchanged, self.geometry, self.outliers, others, rivals, slips)
         return [any(parts) for parts in zip(*by_kind, strict=True)]
 
     def message(self, sample: int) -> str:
@@ -104,6 +111,11 @@ class Diagnosis:
             said.append(f"{self._named(cycle)} look exchanged; exchange their labels.")
         if off := self.outliers[sample]:
             said.append(f"{self._named(off)} look{' like outliers' if off[1:] else 's like an outlier'}; try --robust.")
+        if self.slip and math.isfinite(slip := self.slip[sample]):
+            said.append(
+                f"Arc lengths s that are off by about {1e3 * slip:.2g} mm explain the markers; measure them again, or try "
+                f"--s-std {slip:.1g}."
+            )
         zeta = self.registration[sample]
         if bool(torch.isfinite(zeta).all()):
             shift, turn = 1e3 * float(zeta[:3].norm()), float(zeta[3:].norm().rad2deg())
@@ -302,6 +314,25 @@ def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
     return [tuple(row.nonzero().flatten().tolist()) for row in told]
 
 
+def _slipped(problem: Problem, fit: Estimate, index: Int[Tensor, " b"], settings: Settings) -> Float[Tensor, " b"]:
+    """Per sample of `index`, which is all of the problem, how far off along the rod (m) arc lengths would explain the markers.
+
+    One number for all: the middle one of what the fits leave along the rod.
+    """
+    found, markers = torch.full((len(index),), torch.nan, dtype=torch.float64), problem.markers
+    if markers is None or markers.s_std is not None or not len(index):
+        return found
+    q = problem.shape(fit.x[index][:, : problem.size], differentiable=False).q
+    along = (fit.residual[index] * rotate(q, q.new_tensor([0.0, 0.0, 1.0]))).sum(-1)
+    std = float(along.square().nanmean(-1).sqrt().nanmedian())
+    if not 0 < std < SLIP * problem.robot.rod.length:
+        return found
+    loose = replace(markers, s_std=torch.full_like(markers.s, std))
+    other = estimate_each(replace(problem, sensors=[loose]), replace(settings, basins=0))
+    told = other.accepted & (other.chi2 < LOWERED * fit.chi2[index])
+    return torch.where(told, std, found)
+
+
 def diagnose(
     problem: Problem,
     fit: Estimate,
@@ -322,7 +353,7 @@ def diagnose(
     outliers: list[Cycle] = [()] * B
     markers, L = problem.markers, problem.robot.rod.length
     couple = torch.where(fit.status == int(Status.CONVERGED), couples(fit, problem.robot.rod), torch.nan)
-    tip_instead = torch.zeros(B, dtype=torch.bool)
+    tip_instead, slip = torch.zeros(B, dtype=torch.bool), torch.full((B,), torch.nan, dtype=torch.float64)
 
     def misplaced_at(b: int) -> str:
         if markers is not None:
@@ -354,4 +385,7 @@ def diagnose(
             rest = rest[~fit.accepted[rest] & ~one_more[rest] & registration[rest].isnan().any(-1)]
             for b, off in zip(rest.tolist(), _outliers(richest.take(rest), settings or Settings()), strict=True):
                 outliers[b] = off
-    return Diagnosis(problem.s, tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers), couple, tip_instead)
+            rest = rest[[not outliers[b] for b in rest.tolist()]]
+            slip[rest] = _slipped(own.take(rest), fit, rest, hasty)
+    by_sample = tuple(exchanged), registration, one_more, tuple(geometry), tuple(outliers), couple, tip_instead
+    return Diagnosis(problem.s, *by_sample, slip=tuple(slip.tolist()))

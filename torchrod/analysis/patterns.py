@@ -3,6 +3,7 @@
 400 samples of 20 markers at places of their own are 8,000 markers, of which each sample has seen 20.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -130,7 +131,7 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
     exchanged: list[tuple[tuple[int, ...], ...]] = [()] * B
     geometry, outliers = [""] * B, [()] * B
     others: list[tuple[Solution, ...]] = [()] * B
-    rivals = [""] * B
+    rivals, slip = [""] * B, [math.nan] * B
     for part, pattern in zip(parts, found, strict=True):
         at = pattern.places.tolist()
         for k, b in enumerate(pattern.samples.tolist()):
@@ -139,6 +140,7 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
             geometry[b] = part.geometry[k]
             others[b] = part.others[k] if part.others else ()
             rivals[b] = part.rivals[k] if part.rivals else ""
+            slip[b] = part.slip[k] if part.slip else math.nan
     return Diagnosis(
         problem.s,
         tuple(exchanged),
@@ -150,4 +152,5 @@ def joined_diagnosis(parts: Sequence[Diagnosis], found: Sequence[Pattern], probl
         instead,
         tuple(others),
         tuple(rivals),
+        tuple(slip),
     )
