@@ -5,10 +5,27 @@ their Cramer-Rao bound, and how often the 95 % intervals hold the truth.
 """
 
 import argparse
+import math
 from pathlib import Path
 
 import torch
 from studies.sensors import CASES
+
+ABOUT = """\
+# What every sensor tells
+
+Made by `python scripts/sensors.py`: the 400 mm steel rod of Study 1, {samples} pushes of 0.5 to 1 N at 10 to 39 cm a row, one contact
+with a point-like prior, cold starts. The truth is the forward solve's under point forces; what a sensor reads of it and the noise are
+worked out by the study, not by the library's sensors. In the rows with an uncertain stiffness every push bends a rod of its own,
+which is stated under `[uncertainty]`; the tendons that rub pull with 3 and 1 N along a friction of 0.2.
+
+Of accepted fits: root mean square error; the same over the Cramer-Rao bound, which comes from differences of the forward solve; the
+mean of the posterior's standard deviation over the bound's; how often 95 % intervals hold the truth, those of draws (what `torchrod
+estimate` reports by default, up to 100 samples of a robot that is taken as exact) and those of the covariance (`--intervals
+gaussian`). With {samples} pushes a share of 95 % is known to +-{error:.1f} % (one standard deviation).
+
+| sensors | accepted % | force: error (mN) | over bound | spread over bound | draws hold % | covariance holds % | place: error (mm) | over bound | spread over bound | draws hold % | covariance holds % |
+|---|---|---|---|---|---|---|---|---|---|---|---|"""  # noqa: E501
 
 
 def main() -> None:
@@ -21,10 +38,7 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)  # before the work that would be lost
     torch.set_default_dtype(torch.float64)
-    lines = [
-        "# What every sensor tells",
-        "",
-    ]
+    lines = [ABOUT.format(samples=options.samples, error=1e2 * math.sqrt(0.95 * 0.05 / options.samples))]
     for name in options.cases:
         found = CASES[name]().coverage(options.samples, options.seed)
         cells = [f"{1e2 * found.accepted:.1f}"]

@@ -21,13 +21,14 @@ from torch import Tensor
 from ..estimation.result import Estimate
 from ..estimation.solve import Settings, solver_of
 from ..estimation.starts import Origin, Start
+from ..mechanics.lie import rotate
 from ..model.problem import Problem
 from ..model.uncertainty import Uncertainty
 from .count import free_parameters
 
 ITERATIONS = 25  # of a fit that begins at that of the robot as it is
 ALIKE = 4.0  # of -2 log p: what is behind by less is told as well
-ARC_LENGTH = 0.01  # of the length: by how much arc lengths may be off
+SLIP = 0.05  # of the length: arc lengths that are farther off than that are another mistake
 UNDER = "state it under [uncertainty], or calibrate the robot"
 
 
@@ -96,11 +97,11 @@ def suspected(problem: Problem, x: Float[Tensor, "b n"], settings: Settings) -> 
         scores.append(_score(own, fit, _narrowed(own, fit)))
         words.append([suspect.said(errors) for errors in fit.parameters.tolist()])
         remedies.append(suspect.remedy)
-    if B and (along := _along(problem)) is not None:
-        own, price = along
+    if B and (off := _along(problem, x)):
+        own, price = _loose(problem, off)
         scores.append(_score(own, solve(own, Start.at(x, Origin.OTHER_FIT)), price))
-        words.append(["arc lengths that are off along the rod"] * B)
-        remedies.append("measure them again, or state how well they are known (s_std)")
+        words.append([f"arc lengths that are off by about {1e3 * off:.2g} mm"] * B)
+        remedies.append(f"measure them again, or try --s-std {off:.1g}")
     every = torch.stack(scores)
     best, which = every.min(0)
     said = [""] * B
@@ -110,7 +111,7 @@ def suspected(problem: Problem, x: Float[Tensor, "b n"], settings: Settings) -> 
     return Suspected(best, said)
 
 
-def _score(own: Problem, fit: Estimate, price: Float[Tensor, " b"] | float) -> Float[Tensor, " b"]:
+def _score(own: Problem, fit: Estimate, price: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
     """-2 log p, inf where the fit is not accepted. price: what is to be paid for what is not a load."""
     by_loads = free_parameters(own) * torch.log(own.seen.clamp(min=3).to(fit.chi2.dtype))
     return torch.where(fit.accepted, fit.chi2 + by_loads + price, torch.inf)
@@ -124,12 +125,31 @@ def _narrowed(own: Problem, fit: Estimate) -> Float[Tensor, " b"]:
     return -torch.linalg.slogdet(root.unsqueeze(-1) * C * root)[1].nan_to_num(-math.inf)
 
 
-def _along(problem: Problem) -> tuple[Problem, float] | None:
-    """The problem with arc lengths that are not well known, and what that costs before the data (module)."""
+def _along(problem: Problem, x: Float[Tensor, "b n"]) -> float:
+    """How far off along the rod (m) markers are from their fits x: the middle one of b; 0 where that makes no sense."""
     markers = problem.markers
-    if markers is None or markers.s_std is not None or not markers.isotropic or isinstance(markers.noise, Tensor):
-        return None
-    off = ARC_LENGTH * problem.robot.rod.length
+    if markers is None or not markers.isotropic or isinstance(markers.noise, Tensor):
+        return 0.0
+    shape = problem.shape(x, differentiable=False)
+    first, at = 0, slice(0)
+    for sensor in problem.sensors:
+        at = slice(first, first + len(sensor.s))
+        if sensor is markers:
+            break
+        first = at.stop
+    tangent = rotate(shape.q[:, at], x.new_tensor([0.0, 0.0, 1.0]))
+    fitted = shape.p[:, at]
+    if markers.offsets is not None:
+        fitted = fitted + rotate(shape.q[:, at], markers.offsets)
+    along = ((markers.positions - fitted) * tangent).sum(-1).square().nanmean(-1).sqrt()
+    off = float(along.nanmedian())
+    return off if 0 < off < SLIP * problem.robot.rod.length else 0.0
+
+
+def _loose(problem: Problem, off: float) -> tuple[Problem, Float[Tensor, " b"]]:
+    """The problem with arc lengths that are off by so much (m), and what that costs before the data (module)."""
+    markers = problem.markers
+    assert markers is not None
     own = replace(markers, s_std=torch.full_like(markers.s, off))
-    price = len(markers.s) * math.log1p((off / float(markers.noise)) ** 2)
+    price = markers.present.sum(-1) * math.log1p((off / float(markers.noise)) ** 2)
     return replace(problem, sensors=[own if s is markers else s for s in problem.sensors]), price

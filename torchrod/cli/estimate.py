@@ -32,6 +32,7 @@ from ..learned.warm_start import WarmStart
 from ..mechanics.robot import Robot
 from ..model.load_families import GaussianCoordinates, SmoothCoordinates
 from ..model.problem import FINEST, Problem
+from ..model.sensors import Markers
 from ..model.unknowns import Registration, Scope, Unknowns
 from ..util.errors import InputError
 from ..util.progress import bar
@@ -107,6 +108,7 @@ def _warn_of_idle(options: Namespace, robot: Robot, shapes: Shapes) -> None:
     whole = options.out is not None and not options.out.endswith(".csv")
     idle = {
         "--noise": options.noise is not None and not bool(unstated.any()) and f"{options.shapes} {_own_noise(seen)}",
+        "--s-std": options.s_std is not None and _all_places(shapes) and f"{options.shapes} {_all_places(shapes)}",
         "--angle-noise": options.angle_noise is not None and lacks.get("orientations"),
         "--curvature-noise": options.curvature_noise is not None and lacks.get("curvature"),
         "--base-noise": options.base_noise is not None and lacks.get("base_wrench"),
@@ -119,6 +121,13 @@ def _warn_of_idle(options: Namespace, robot: Robot, shapes: Shapes) -> None:
     for option, why in idle.items():
         if why:
             warnings.warn(f"{option} has no effect: {why}", stacklevel=2)
+
+
+def _all_places(shapes: Shapes) -> str:
+    """What a file has instead of positions at arc lengths; nothing where it has some."""
+    if any(isinstance(sensor, Markers) for sensor in shapes.stated):
+        return ""
+    return "has no positions x,y,z but those of orientations" if "orientations" in shapes.readings else "has no positions at s"
 
 
 def _own_noise(seen: Bool[Tensor, "B P"]) -> str:
@@ -193,7 +202,9 @@ def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shap
                 "and then, so calibrate the robot",
                 stacklevel=2,
             )
-    noises = Noises(stated, angle, base, options.curvature_noise)
+    if options.s_std is not None:
+        positive("--s-std", options.s_std)
+    noises = Noises(stated, angle, base, options.curvature_noise, options.s_std)
     try:
         unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.of_a_sample)
         return Problem(robot, unknowns, shapes.sensors(noises), shapes.tension, options.steps or 0)

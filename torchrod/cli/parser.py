@@ -81,6 +81,8 @@ def _estimate_parser() -> ArgumentParser:
     parser.add_argument("--axial", action="store_true", help="each load may drag along the rod by any force, whatever its friction")
     about = "std of a marker coordinate (m); auto: from the residual (default: as calibrated, else 1e-3)"
     parser.add_argument("--noise", type=str, default=None, help=about)  # None tells that nobody gave it
+    along = "std of the arc lengths s of markers, each off by itself along the rod (m); else exact"
+    parser.add_argument("--s-std", type=float, default=None, help=along)
     angle = "std of a measured orientation, about each axis (rad) (default: 0.01)"
     parser.add_argument("--angle-noise", type=float, default=None, help=angle)
     _number_list(parser, "--base-noise", "std of a measured base wrench (N, N m)", 2, ("FORCE", "MOMENT"))

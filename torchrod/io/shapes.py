@@ -76,11 +76,16 @@ class Shapes(Float64):
         return replace(self, positions=p, readings=readings)
 
     @property
-    def groups(self) -> int:
-        """How many groups of rows the sensors have together, as Problem.group_count."""
+    def stated(self) -> list[Sensor]:
+        """The sensors, whatever their noise."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return sum(int(sensor.groups.max()) + 1 for sensor in self.sensors(Noises(1.0, 1.0, (1.0, 1.0), 1.0)))
+            return self.sensors(Noises(1.0, 1.0, (1.0, 1.0), 1.0))
+
+    @property
+    def groups(self) -> int:
+        """How many groups of rows the sensors have together, as Problem.group_count."""
+        return sum(int(sensor.groups.max()) + 1 for sensor in self.stated)
 
     def measured(self, zeta: Float[Tensor, " 6"], markers: Float[Tensor, "n 5"]) -> "Shapes":
         """The inverse of `corrected` for positions; markers of which nothing is known are measured where they are."""
@@ -106,13 +111,14 @@ class Shapes(Float64):
 @dataclass(frozen=True)
 class Noises:
     """Standard deviations of what files do not state row by row: position (m), angle (rad), base force (N) and moment (N m),
-    curvature (1/m).
+    curvature (1/m), the arc length of a marker (m); None takes it as exact.
     """
 
     position: float
     angle: float
     base: tuple[float, float] | None = None
     curvature: float | None = None
+    arc_length: float | None = None
 
 
 class Of(Enum):
@@ -162,7 +168,10 @@ def _markers(shapes: Shapes, noise: Noises) -> Markers | None:
     places = ~_turned(shapes)
     if shapes.readings:
         places = places & torch.isfinite(shapes.positions).all(-1).any(0)
-    return _at(shapes, noise, places) if bool(places.any()) else None
+    if not bool(places.any()):
+        return None
+    own, std = _at(shapes, noise, places), noise.arc_length
+    return own if std is None else replace(own, s_std=torch.full_like(own.s, std))
 
 
 def _poses(shapes: Shapes, noise: Noises) -> Poses | None:

@@ -144,7 +144,7 @@ def _markers(path: Path, found: Recording, layout: Layout, robot: Robot, base: B
         if not enough.any() or told[enough].mean() < TOLD:
             raise InputError(
                 f"{path}: in hardly any of its {len(p)} frames do points lie as markers on a rod would at the s of {layout.path}; "
-                "check s, units, up and the base frame"
+                "check s, units, up, left_handed and the base frame"
             )
         gone = int((~told).sum())
         if gone:

@@ -46,7 +46,7 @@ def base_in(path: Path, layout: Layout, plate: Plate, found: Recording) -> Base:
             raise InputError(f"{layout.path}: base.names is missing; a plate that moves is known by its markers' names")
         z = torch.from_numpy(_places_of_plate(path, plate.at, found))[None]
         R, t, off = aligned(plate.at, z)
-        return Base(R, t, float(off), (), z[0])
+        return Base(R, t, _checked(path, layout, plate.at, z, off), (), z[0])
     if missing := [name for name in names if name not in found.points]:
         raise InputError(f"{layout.path}: base.names has {shown(missing[0])}, which is not in {path}; {named(found)}")
     z = torch.from_numpy(np.stack([found.points[name] for name in names], 1))
@@ -57,17 +57,21 @@ def base_in(path: Path, layout: Layout, plate: Plate, found: Recording) -> Base:
         raise InputError(
             f"{path}: fewer than three markers of the base plate were seen together; name others in the layout's [base]"
         )
-    size = float((plate.at - plate.at.mean(0)).norm(dim=-1).max())
-    rms = float(off.nanmedian())
+    return Base(R, t, _checked(path, layout, plate.at, z, off), tuple(names))
+
+
+def _checked(path: Path, layout: Layout, at: Float[Tensor, "M 3"], z: Float[Tensor, "F M 3"], off: Float[Tensor, " F"]) -> float:
+    """How far off (m, rms) a plate's markers z are. Errors: InputError for a plate that lies so only in a mirror, or not at all."""
+    size, rms = float((at - at.mean(0)).norm(dim=-1).max()), float(off.nanmedian())
     if rms > ALIKE * size:
-        flip = plate.at * plate.at.new_tensor([1.0, 1.0, -1.0])
+        flip = at * at.new_tensor([1.0, 1.0, -1.0])
         mirrored = float(aligned(flip, z)[2].nanmedian())
         if mirrored < 0.3 * rms and mirrored < 2 * ALIKE * size:
             raise InputError(_mirrored(path, layout))
         raise InputError(
             f"{path}: the base plate's markers lie {1e3 * rms:.3g} mm from their places; check base.names and base.at of the layout"
         )
-    return Base(R, t, rms, tuple(names))
+    return rms
 
 
 def _mirrored(path: Path, layout: Layout) -> str:
