@@ -374,5 +374,7 @@ def diagnose(
             rest = rest[[not robot[b] for b in rest.tolist()]]
             for b, some in zip(rest.tolist(), _outliers(richest.take(rest), settings or Settings()), strict=True):
                 outliers[b] = some
+    if problem.unknowns.tip == "none" and problem.state.loads.size and len(problem.s.unique()) == 1:
+        geometry = [said or ONE_PLACE.format(1e3 * float(problem.s[0])) for said in geometry]  # of a fit that is accepted, too
     found = registration, one_more, tuple(geometry), tuple(outliers), couple, tip_instead
     return Diagnosis(problem.s, tuple(exchanged), *found, robot=tuple(robot))

@@ -40,10 +40,8 @@ from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, noise_or_auto, pos
 from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
-MOST_DRAWN, MOST_READINGS = (
-    100,
-    200,
-)  # samples, and numbers of each, of which draws are taken where torch works out what sensors read
+MOST_DRAWN, MOST_READINGS = 100, 200  # samples, and numbers of each, that are drawn where torch works out what sensors read;
+MOST_RUBBING = 10  # where tendons rub as well: a second each
 ANGLE_NOISE = 0.01  # rad
 ROUGHLY = 0.15  # a share: what a polynomial in the error of a stiffness follows
 EXACT = (
@@ -145,7 +143,8 @@ def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
     if options.intervals == "sampled" or not quick:
         return options.intervals == "sampled"
     plain = kernel_serves(problem) and not (problem.state.tip.size or problem.state.tension.size)
-    few = problem.batch <= MOST_PROFILES if plain else problem.batch <= MOST_DRAWN and len(problem.groups) <= MOST_READINGS
+    most = MOST_DRAWN if problem.robot.tendons.friction is None else MOST_RUBBING
+    few = problem.batch <= MOST_PROFILES if plain else problem.batch <= most and len(problem.groups) <= MOST_READINGS
     if not few:
         warnings.warn(
             f"the intervals of {problem.batch} samples are those of the covariance"
