@@ -329,7 +329,7 @@ def test_markers_know_nothing_of_a_stiffness_of_weightless_rods():
 
 
 def test_two_stiffnesses_off_at_once_are_one_robot():
-    """h at theta = (1, 1) and (-1, -1) is that of robots that are off by both, but for what is of third order."""
+    """h at theta = (1, 1) and (-1, -1) is that of robots that are off by both."""
     robot = busy_robot()
     stated = Uncertainty(stiffness=0.1, oval=0.08)
     problem = problem_of(robot, stated, 20)
@@ -347,5 +347,25 @@ def test_two_stiffnesses_off_at_once_are_one_robot():
         vars(off)["state"] = problem.exact.state
         found.append(problem.h(both, False))
         true.append(off.h(plain, False))
-        assert float((found[-1] - true[-1]).abs().max()) < 0.02 * float((problem.exact.h(plain, False) - true[-1]).abs().max())
-    assert torch.allclose(found[0] + found[1], true[0] + true[1], rtol=0, atol=1e-12), "what is even in the two errors is exact"
+    assert torch.allclose(torch.cat(found), torch.cat(true), rtol=0, atol=1e-12)
+
+
+def test_a_section_oval_in_any_direction():
+    """By up to two deviations, on a robot that its tendons bend: within 2 % of what that moves, of which a mixed term of second order
+    alone left 5 %.
+    """
+    robot, std = busy_robot(), 0.1
+    stated = Uncertainty(oval=std)
+    problem = problem_of(robot, stated, 20)
+    x = torch.zeros(2, problem.size)
+    x[:, problem.state.base.at] = 0.5
+    plain, _ = problem.without_parameters(x)
+    there = problem.exact.h(plain, False)
+    for turn in torch.linspace(0.2, 6.2, 7).tolist():
+        theta = {"oval_1": 2 * std * math.cos(turn), "oval_2": 2 * std * math.sin(turn)}
+        both = x.clone()
+        both[:, problem.state.parameters.at] = T(list(theta.values())) / std
+        off = replace(problem.exact, robot=stated.found_at(robot, theta)[0])
+        vars(off)["state"] = problem.exact.state
+        true = off.h(plain, False)
+        assert (problem.h(both, False) - true).norm() < 0.02 * (there - true).norm()

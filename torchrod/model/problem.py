@@ -344,8 +344,8 @@ class Problem(Float64):
         return found
 
     @cached_property
-    def wide(self) -> tuple[bool, ...]:
-        """Which parameters have a quartic (model.uncertainty)."""
+    def wide(self) -> tuple[float, ...]:
+        """Which parameters have a quartic, and how far it reaches (model.uncertainty)."""
         assert self.unknowns.uncertainty is not None
         return self.unknowns.uncertainty.wide(self.robot)
 

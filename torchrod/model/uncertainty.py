@@ -7,9 +7,9 @@ error unknown, within what is known of it, intervals hold (docs/trust.md). The m
 
 through h(x, 0) and h_k+-, of a robot whose parameter k is off by one standard deviation upwards and downwards; the errors of two
 parameters act side by side. dh/dx follows by the same parabola. Of a stiffness that may be off by more than WIDE the slope of a
-parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through half a deviation as well, and two of
-them have a mixed term, through robots that are off by both. Where a calibration has found errors that are correlated, theta_k moves
-all of them along a column of a root of their covariance, by a parabola.
+parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through FAR deviations (or NEAR) as well, and
+two of them have mixed terms up to theta_i^2 theta_j^2, through robots that are off by both. Where a calibration has found errors
+that are correlated, theta_k moves all of them along a column of a root of their covariance, by a parabola.
 """
 
 import itertools
@@ -36,6 +36,8 @@ SHIFT, TURN = (tuple(f"frame_{kind}{axis}" for axis in "xyz") for kind in ("", "
 STRAIN = tuple(f"metric_{axes}" for axes in ("xx", "yy", "zz", "yz", "xz", "xy"))
 MOST_MIXED = 4  # stiffnesses, of which all pairs have a mixed term
 WIDE, OF_STIFFNESS = 0.04, ("stiffness", "oval")  # a share, and whose
+FAR, NEAR = 2.0, 0.5  # deviations: where a quartic goes through beside one, if that leaves half of the stiffness or not
+CORNER = 1.5  # deviations, of both of a pair that goes FAR
 NONE = 1e-12  # of a standard deviation: what is left of a direction that is none
 Change = Callable[[Robot, float], Robot]
 
@@ -185,24 +187,28 @@ class Uncertainty:
         C[at.unsqueeze(-1), at] += self.found.covariance - torch.diag(self.found.covariance.diagonal())
         return std.unsqueeze(-1) * torch.linalg.cholesky(_correlation(C) + NONE * torch.eye(len(C), dtype=DTYPE))
 
-    def wide(self, robot: Robot) -> tuple[bool, ...]:
-        """Of every unknown xi whether a parabola does not do for it; errors that a calibration has mixed keep theirs, along which a
-        shape that nothing explains runs far.
+    def wide(self, robot: Robot) -> tuple[float, ...]:
+        """How many deviations off the quartic of every unknown xi goes through, 0 where a parabola does: FAR of a section that is
+        oval, of which any direction of the two errors is as likely. Errors that a calibration has mixed keep their parabola, along
+        which a shape that nothing explains runs far.
         """
         if self.found is not None:
-            return (False,) * len(self.parameters(robot))
-        stiff = [p.name.split("_")[0] in OF_STIFFNESS for p in self.parameters(robot)]
-        columns = self.root(robot).mT.tolist()
-        return tuple(any(s and abs(error) > WIDE for s, error in zip(stiff, errors, strict=True)) for errors in columns)
+            return (0.0,) * len(self.parameters(robot))
+        found = []
+        for p in self.parameters(robot):
+            kind = p.name.split("_")[0]
+            far = FAR if kind == "oval" and FAR * p.std <= MOST_SHARE else NEAR
+            found.append(far if kind in OF_STIFFNESS and p.std > WIDE else 0.0)
+        return tuple(found)
 
     def nearby(self, robot: Robot) -> list[tuple[Robot, Warp | None]]:
-        """Robots off by one of every unknown xi, upwards and downwards, in turn, and by half of it where that is wide; then by both
-        of every `mixed` pair; and how they are measured.
+        """Robots off by one of every unknown xi, upwards and downwards, in turn, and farther where that is wide; then by both of
+        every `mixed` pair; and how they are measured.
         """
         columns, wide = self.root(robot).mT, self.wide(robot)
-        shares = [(k, share) for k, whether in enumerate(wide) for share in ((1.0, -1.0, 0.5, -0.5) if whether else (1.0, -1.0))]
+        shares = [(k, share) for k, far in enumerate(wide) for share in ((1.0, -1.0, far, -far) if far else (1.0, -1.0))]
         every = [share * columns[k] for k, share in shares]
-        every += [sign * (columns[i] + columns[j]) for i, j in mixed(wide) for sign in (1.0, -1.0)]
+        every += [a * columns[i] + b * columns[j] for i, j in mixed(wide) for a, b in _corners(wide, i, j)]
         return [self._off_by(robot, errors.tolist()) for errors in every]
 
     def _off_by(self, robot: Robot, errors: list[float]) -> tuple[Robot, Warp | None]:
@@ -363,33 +369,46 @@ def _with_rows(rod: Rod, places: list[float]) -> Float[Tensor, "rows 4"]:
 
 
 def near_zero(
-    at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"], wide: Sequence[bool]
+    at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"], wide: Sequence[float]
 ) -> tuple[Float[Tensor, "B z *m"], list[Float[Tensor, "B z *m"]]]:
     """(1), and its derivatives by each theta, from the values at zero and at what `nearby` has of each, in turn."""
-    others, value, slopes, curved = iter(off), at_zero.clone(), [], []
+    others, value, slopes, parts = iter(off), at_zero.clone(), [], []
     each = [t.reshape(-1, *[1] * (at_zero.ndim - 1)) for t in theta.unbind(-1)]
-    for t, whether in zip(each, wide, strict=True):
+    for t, far in zip(each, wide, strict=True):
         up, down = next(others), next(others)
         odd, even = 0.5 * (up - down), 0.5 * (up + down) - at_zero
-        slope = odd
-        curved.append(even)
-        if whether:
+        cubic, quartic, slope = 0.0, 0.0, odd
+        if far:
             up, down = next(others), next(others)
-            cubic, quartic = (odd - (up - down)) / 0.75, (even - 4 * (0.5 * (up + down) - at_zero)) / 0.75
+            cubic = (0.5 * (up - down) / far - odd) / (far**2 - 1)
+            quartic = ((0.5 * (up + down) - at_zero) / far**2 - even) / (far**2 - 1)
             odd, even = odd - cubic, even - quartic
             value.addcmul_(t**3, cubic).addcmul_(t**4, quartic)
             slope = odd + 3 * t**2 * cubic + 4 * t**3 * quartic
         value.addcmul_(t, odd).addcmul_(t**2, even)
         slopes.append(slope + 2 * t * even)
+        parts.append((odd, even, cubic, quartic))
     for i, j in mixed(wide):
-        cross = 0.5 * (next(others) + next(others)) - at_zero - curved[i] - curved[j]
-        value.addcmul_(each[i] * each[j], cross)
-        slopes[i].addcmul_(each[j], cross)
-        slopes[j].addcmul_(each[i], cross)
+        a, b, c = each[i], each[j], _corners(wide, i, j)[0][0]
+        pp, pm, mp, mm = (next(others) for _ in range(4))
+        (odd_i, even_i), (odd_j, even_j) = (
+            (odd * c + cubic * c**3, even * c**2 + quartic * c**4) for odd, even, cubic, quartic in (parts[i], parts[j])
+        )
+        ab, aab = 0.25 * (pp - pm - mp + mm) / c**2, (0.25 * (pp - pm + mp - mm) - odd_j) / c**3
+        abb, aabb = (0.25 * (pp + pm - mp - mm) - odd_i) / c**3, (0.25 * (pp + pm + mp + mm) - at_zero - even_i - even_j) / c**4
+        value.addcmul_(a * b, ab + a * aab + b * abb + (a * b) * aabb)
+        slopes[i].addcmul_(b, ab + 2 * a * aab + b * abb + 2 * (a * b) * aabb)
+        slopes[j].addcmul_(a, ab + a * aab + 2 * b * abb + 2 * (a * b) * aabb)
     return value, slopes
 
 
-def mixed(wide: Sequence[bool]) -> list[tuple[int, int]]:
+def _corners(wide: Sequence[float], i: int, j: int) -> list[tuple[float, float]]:
+    """By how many deviations both of a pair are off at its four robots: it has all terms up to theta_i^2 theta_j^2."""
+    c = CORNER if min(wide[i], wide[j]) == FAR else 1.0
+    return [(c, c), (c, -c), (-c, c), (-c, -c)]
+
+
+def mixed(wide: Sequence[float]) -> list[tuple[int, int]]:
     """Pairs of wide ones; none where there are more than MOST_MIXED of these."""
-    at = [k for k, whether in enumerate(wide) if whether]
+    at = [k for k, far in enumerate(wide) if far]
     return list(itertools.combinations(at, 2)) if len(at) <= MOST_MIXED else []
