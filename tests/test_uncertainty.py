@@ -351,9 +351,7 @@ def test_two_stiffnesses_off_at_once_are_one_robot():
 
 
 def test_a_section_oval_in_any_direction():
-    """By up to two deviations, on a robot that its tendons bend: within 2 % of what that moves, of which a mixed term of second order
-    alone left 5 %.
-    """
+    """By two deviations, on a robot that its tendons bend: within 2 % of what that moves; a mixed term of second order left 5 %."""
     robot, std = busy_robot(), 0.1
     stated = Uncertainty(oval=std)
     problem = problem_of(robot, stated, 20)
