@@ -3,7 +3,7 @@
 The marginal likelihood of a hypothesis is the mean weight of the draws of its posterior (estimation.draws), with priors that are
 normalized. Probabilities p_h, by which loads are reported, are in its proportion, times ONE_MORE for each load; a smooth load is
 reported where no other explains the readings. The resultant, and f(s) along the rod, which all of them have, are of draws of all of
-them, weighted with HIDDEN for each load: one that is not reported may be there, and must not be left out of an interval.
+them, weighted by the marginal likelihood alone: a load that is not reported may be there, and must not be left out of an interval.
 Source: Hoeting et al., Statistical Science 14 (1999) 382.
 """
 
@@ -25,7 +25,6 @@ from ..util.precision import DTYPE
 from .count import Bar, Evidence, Hypothesis, Selection, no_bar
 
 ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
-HIDDEN = 0.5  # the same where that does not matter, for what is averaged
 OF_ANY_FORM = 0.0  # loads that a smooth one counts as: there are more forms of a distributed load than one
 POSSIBLE = 0.05  # of the probability: a form of the loads that is not left out
 ANY_FORM = "smooth"
@@ -72,7 +71,6 @@ def average(
         for h, c, own in zip(held.tolist(), candidates, problems, strict=True)
     ]
     rarer = math.log(ONE_MORE) * torch.tensor(more)
-    hidden = math.log(HIDDEN) * torch.tensor([0 if h else c.contacts for h, c in zip(held.tolist(), candidates, strict=True)])
     forms = [_form(c) for c in candidates]
     fit, choice = found.fit, found.evidence.choice.clone()
     collected = Collected(fit)
@@ -90,7 +88,7 @@ def average(
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
                     collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen)))
-            _mix(collected, chunk, drawn, _probabilities(drawn, scores[chunk], hidden), forms)
+            _mix(collected, chunk, drawn, _probabilities(drawn, scores[chunk]), forms)
             shown.update(len(chunk))
     evidence = replace(found.evidence, choice=choice, probability=probability)
     return Averaged(fit, evidence, collected.whole(fit))
@@ -126,7 +124,9 @@ def _drawn(
     return drawn
 
 
-def _probabilities(drawn: list[_Drawn], scores: Float[Tensor, "c H"], before: Float[Tensor, " H"]) -> Float[Tensor, "c H"]:
+def _probabilities(
+    drawn: list[_Drawn], scores: Float[Tensor, "c H"], before: Float[Tensor, " H"] | float = 0.0
+) -> Float[Tensor, "c H"]:
     """By the evidence and what hypotheses are worth before it, in logarithms; by the BIC where draws are not to be trusted."""
     log_evidence = torch.full_like(scores, -torch.inf)
     for d in drawn:
