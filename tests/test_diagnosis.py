@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +14,14 @@ from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
 from tests.study import study1
 from torchrod import (
+    Diagnosis,
     GaussianCoordinates,
     Markers,
     PointForces,
     Problem,
     Registration,
     Robot,
+    Rod,
     Settings,
     Shapes,
     Tendon,
@@ -278,3 +281,45 @@ def test_what_is_off_of_the_robot_is_named(what, said):
     assert len(refused) > 8
     assert sum(any(words in found.message(b) for words in said) for b in refused) > 0.6 * len(refused)
     assert any(said[0] in found.message(b) for b in refused)
+
+
+def test_arc_lengths_that_are_off_are_told_in_a_base_frame_that_is_unknown():
+    """By their own size, not by that of the frame's error: 16 mm and 9 degrees."""
+    problem = off_by("arc lengths").take(torch.arange(6))
+    markers = problem.markers
+    assert markers is not None
+    zeta = T([5e-3, -3e-3, 15e-3, 0.1, -0.12, 0.0])
+    R, t = roma.rotvec_to_rotmat(zeta[3:].double()), zeta[:3].double()
+    plain, framed = (
+        diagnose(some, estimate(some))
+        for some in (
+            problem,
+            problem.of(replace(problem.unknowns, registration=Registration())).moved(R, t),
+        )
+    )
+
+    def told(diagnosis: Diagnosis) -> list[float]:
+        found = [re.search(r"off by about ([0-9.]+) mm", diagnosis.message(b)) for b in range(problem.batch)]
+        return [float(size[1]) for size in found if size]
+
+    assert len(told(framed)) >= 3
+    assert max(told(framed)) < 1.3 * max(told(plain))
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3])
+def test_a_strip_that_no_load_explains_has_a_diagnosis(turned):
+    """Which to its soft side has less stiffness than a round rod is off by."""
+    rod, L = steel_rod().rod, 0.4
+    R = roma.rotvec_to_rotmat(T([0.0, 0.0, turned]).double())
+    K = R @ T([0.05, 20.0, 0.2]).double().diag() @ R.mT * rod.bending_stiffness
+    robot = Robot(Rod.from_stiffness(L, rod.K_se, 0.5 * (K + K.mT)))
+    load = PointForces(T([[[0.02, 0.02, 0.0], [-0.02, 0.01, 0.0]]]), T([[0.15, 0.35]]))
+    s = torch.linspace(0.02, L, 20)
+    problem = Problem(
+        robot,
+        Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale)),
+        [Markers(s, solve_shape(robot, (load,), None, s, 1).p + 4e-3 * (s > 0.2).double().unsqueeze(-1), 1e-4)],
+    )
+    fit = estimate(problem)
+    assert not bool(fit.accepted)
+    assert "stiffer to one side" not in diagnose(problem, fit).message(0)

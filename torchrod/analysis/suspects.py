@@ -21,13 +21,16 @@ from torch import Tensor
 from ..estimation.result import Estimate
 from ..estimation.solve import Settings, solver_of
 from ..estimation.starts import Origin, Start
-from ..mechanics.lie import rotate
+from ..mechanics.lie import exponential, rotate
+from ..mechanics.rod import Rod
 from ..model.problem import Problem
 from ..model.uncertainty import Uncertainty
 from .count import free_parameters
 
 ITERATIONS = 25  # of a fit that begins at that of the robot as it is
 ALIKE = 4.0  # of -2 log p: what is behind by less is told as well
+OVAL = 0.1  # of EI
+NOT_FLAT = 2 * OVAL  # of EI: of a rod that is softer to one side than that, OVAL would leave nothing there
 SLIP = 0.05  # of the length: arc lengths that are farther off than that are another mistake
 UNDER = "state it under [uncertainty], or calibrate the robot"
 
@@ -58,8 +61,9 @@ def suspects(problem: Problem) -> list[Suspect]:
     found = [
         Suspect(Uncertainty(stiffness=0.1), _share("a stiffness that is")),
         Suspect(Uncertainty(set=0.1 / L), _size("a rod that is bent, unloaded, other than its file says,", "1/m")),
-        Suspect(Uncertainty(oval=0.1), _size("a section that is stiffer to one side", "%", 100)),
     ]
+    if _softer_side(robot.rod) > NOT_FLAT * robot.rod.bending_stiffness:
+        found.append(Suspect(Uncertainty(oval=OVAL), _size("a section that is stiffer to one side", "%", 100)))
     if problem.tension is not None:
         found += [
             Suspect(Uncertainty(tension=0.1), _share("tensions that are")),
@@ -71,6 +75,11 @@ def suspects(problem: Problem) -> list[Suspect]:
             Suspect(Uncertainty(gravity=math.radians(10)), _size("gravity that is turned", "degrees", math.degrees(1))),
         ]
     return found
+
+
+def _softer_side(rod: Rod) -> float:
+    """The least stiffness in bending (N m^2), where the rod is free to twist."""
+    return 1 / float(torch.linalg.eigvalsh(rod.K_bt.detach().inverse()[:2, :2])[-1])
 
 
 @dataclass(frozen=True)
@@ -130,17 +139,13 @@ def _along(problem: Problem, x: Float[Tensor, "b n"]) -> float:
     markers = problem.markers
     if markers is None or not markers.isotropic or isinstance(markers.noise, Tensor):
         return 0.0
-    shape = problem.shape(x, differentiable=False)
-    first, at = 0, slice(0)
-    for sensor in problem.sensors:
-        at = slice(first, first + len(sensor.s))
-        if sensor is markers:
-            break
-        first = at.stop
-    tangent = rotate(shape.q[:, at], x.new_tensor([0.0, 0.0, 1.0]))
-    fitted = shape.p[:, at]
-    if markers.offsets is not None:
-        fitted = fitted + rotate(shape.q[:, at], markers.offsets)
+    before = problem.sensors[: next(k for k, sensor in enumerate(problem.sensors) if sensor is markers)]
+    places, rows = sum(len(sensor.s) for sensor in before), sum(sensor.rows for sensor in before)
+    fitted = problem.h(x, differentiable=False)[:, rows : rows + markers.rows].unflatten(-1, (-1, 3))
+    q = problem.shape(x, differentiable=False).q[:, places : places + len(markers.s)]
+    tangent = rotate(q, x.new_tensor([0.0, 0.0, 1.0]))
+    if problem.state.registration.size:
+        tangent = rotate(exponential(problem.state.registration.of(x)[:, 3:]).unsqueeze(1), tangent)
     along = ((markers.positions - fitted) * tangent).sum(-1).square().nanmean(-1).sqrt()
     off = float(along.nanmedian())
     return off if 0 < off < SLIP * problem.robot.rod.length else 0.0
