@@ -367,3 +367,11 @@ def test_a_section_oval_in_any_direction():
         vars(off)["state"] = problem.exact.state
         true = off.h(plain, False)
         assert (problem.h(both, False) - true).norm() < 0.02 * (there - true).norm()
+
+
+def test_a_strip_that_is_oval_by_more_than_it_bears_is_refused_in_one_sentence():
+    K = steel_rod().rod.K_bt * torch.diag(T([30.0, 1 / 30, 1.0]))
+    robot = replace(steel_rod(), rod=replace(steel_rod().rod, K_bt=K))
+    with pytest.raises(ValueError, match=r"oval is 0.1, more than the rod's softer side has, 0.033 EI; state less"):
+        estimate(problem_of(robot, Uncertainty(oval=0.1), 20))
+    assert problem_of(robot, Uncertainty(oval=0.02), 20).size

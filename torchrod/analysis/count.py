@@ -92,7 +92,7 @@ class Evidence:
         if best == chosen or rest[best] < CLOSE:
             return ""
         both = f"{chosen} ({100 * shares[chosen]:.0f} %) and {best} ({100 * rest[best]:.0f} %)"
-        return f"Among the numbers and kinds of loads, {both} explain the readings nearly alike."
+        return f"Among the numbers and kinds of loads, {both} remain possible."
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,6 @@ from ..estimation.result import Estimate
 from ..estimation.solve import Settings, solver_of
 from ..estimation.starts import Origin, Start
 from ..mechanics.lie import exponential, rotate
-from ..mechanics.rod import Rod
 from ..model.problem import Problem
 from ..model.uncertainty import Uncertainty
 from .count import free_parameters
@@ -32,16 +31,25 @@ ALIKE = 4.0  # of -2 log p: what is behind by less is told as well
 OVAL = 0.1  # of EI
 NOT_FLAT = 2 * OVAL  # of EI: of a rod that is softer to one side than that, OVAL would leave nothing there
 SLIP = 0.05  # of the length: arc lengths that are farther off than that are another mistake
-UNDER = "state it under [uncertainty], or calibrate the robot"
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A parameter of the robot that may be off: its deviation, what is said of its errors, and the remedy."""
+    """A parameter of the robot that may be off: a kind of Uncertainty, its standard deviation, and what is said of its errors."""
 
-    stated: Uncertainty
+    kind: str
+    std: float
     said: Callable[[list[float]], str]
-    remedy: str = UNDER
+
+    @property
+    def stated(self) -> Uncertainty:
+        """It alone."""
+        return Uncertainty(**{self.kind: self.std})  # pyright: ignore[reportArgumentType]
+
+    @property
+    def remedy(self) -> str:
+        """By its key in ROBOT.toml."""
+        return f'state "{self.kind} = {self.std:.2g}" under [uncertainty], or calibrate the robot'
 
 
 def _share(what: str) -> Callable[[list[float]], str]:
@@ -59,27 +67,22 @@ def suspects(problem: Problem) -> list[Suspect]:
         return []
     L = robot.rod.length
     found = [
-        Suspect(Uncertainty(stiffness=0.1), _share("a stiffness that is")),
-        Suspect(Uncertainty(set=0.1 / L), _size("a rod that is bent, unloaded, other than its file says,", "1/m")),
+        Suspect("stiffness", 0.1, _share("a stiffness that is")),
+        Suspect("set", 0.1 / L, _size("a rod that is bent, unloaded, other than its file says,", "1/m")),
     ]
-    if _softer_side(robot.rod) > NOT_FLAT * robot.rod.bending_stiffness:
-        found.append(Suspect(Uncertainty(oval=OVAL), _size("a section that is stiffer to one side", "%", 100)))
+    if robot.rod.softer_side > NOT_FLAT:
+        found.append(Suspect("oval", OVAL, _size("a section that is stiffer to one side", "%", 100)))
     if problem.tension is not None:
         found += [
-            Suspect(Uncertainty(tension=0.1), _share("tensions that are")),
-            Suspect(Uncertainty(friction=0.2), _size("tendons that rub, mu times their motion", "in all")),
+            Suspect("tension", 0.1, _share("tensions that are")),
+            Suspect("friction", 0.2, _size("tendons that rub, mu times their motion", "in all")),
         ]
     if not robot.weightless:
         found += [
-            Suspect(Uncertainty(mass=0.2), _share("a mass that is")),
-            Suspect(Uncertainty(gravity=math.radians(10)), _size("gravity that is turned", "degrees", math.degrees(1))),
+            Suspect("mass", 0.2, _share("a mass that is")),
+            Suspect("gravity", math.radians(10), _size("gravity that is turned", "degrees", math.degrees(1))),
         ]
     return found
-
-
-def _softer_side(rod: Rod) -> float:
-    """The least stiffness in bending (N m^2), where the rod is free to twist."""
-    return 1 / float(torch.linalg.eigvalsh(rod.K_bt.detach().inverse()[:2, :2])[-1])
 
 
 @dataclass(frozen=True)

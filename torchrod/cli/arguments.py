@@ -88,9 +88,14 @@ def noise_or_auto(value: str, length: float) -> float | None:
     except ValueError:
         raise InputError(f"--noise is {value}; it must be auto or a standard deviation in metres") from None
     noise_std(number)
-    if number > COARSEST * length:
-        raise InputError(f"--noise is {value} m on a rod of {length:g} m; it is in metres: 1 mm is 1e-3")
+    in_metres("--noise", number, length)
     return number
+
+
+def in_metres(name: str, value: float, length: float) -> None:
+    """Refuse a standard deviation (m) that is large beside the rod's length (m): it is in another unit."""
+    if value > COARSEST * length:
+        raise InputError(f"{name} is {value:g} m on a rod of {length:g} m; it is in metres: 1 mm is 1e-3")
 
 
 def noise_std(value: float) -> None:

@@ -36,7 +36,7 @@ from ..model.sensors import Markers
 from ..model.unknowns import Registration, Scope, Unknowns
 from ..util.errors import InputError
 from ..util.progress import bar
-from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, noise_or_auto, positive, writable
+from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, in_metres, noise_or_auto, positive, writable
 from .table import table
 
 MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 0.6 ms each
@@ -203,6 +203,7 @@ def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shap
             )
     if options.s_std is not None:
         positive("--s-std", options.s_std)
+        in_metres("--s-std", options.s_std, rod.length)
     noises = Noises(stated, angle, base, options.curvature_noise, options.s_std)
     try:
         unknowns = Unknowns(loads, options.unknown_tip, std, registration, uncertainty=nearly.of_a_sample)

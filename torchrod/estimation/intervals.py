@@ -181,6 +181,10 @@ class Collected:
 
     def whole(self, fit: Estimate) -> Intervals:
         """Of all samples of a fit."""
+        band = self.values["band"]
+        if band is not None:  # |f| of draws is never nothing: where neither component is told from zero, it may be
+            nothing = ((band[:, :, :2, 0] <= 0) & (band[:, :, :2, 1] >= 0)).all(-1)
+            band[:, :, 2, 0] = torch.where(nothing, 0.0, band[:, :, 2, 0])
         return _hull(Intervals(**self.values), fit)  # pyright: ignore[reportArgumentType]
 
 

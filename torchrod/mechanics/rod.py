@@ -134,6 +134,11 @@ class Rod(Float64):
         return about_y / self.bending_stiffness, about_x / self.bending_stiffness
 
     @property
+    def softer_side(self) -> float:
+        """The least stiffness in bending, where the rod is free to twist, in units of EI: 1 for a round section."""
+        return 1 / float(torch.linalg.eigvalsh(self.K_bt.detach().inverse()[:2, :2])[-1]) / self.bending_stiffness
+
+    @property
     def force_scale(self) -> float:
         """4 EI / L^2 (N): a force that bends the rod visibly; 1 N for the paper's rod, so that the paper's units carry over.
 

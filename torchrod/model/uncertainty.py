@@ -162,9 +162,11 @@ class Uncertainty:
     def parameters(self, robot: Robot) -> tuple[Parameter, ...]:
         """What is unknown of a robot; that of tendons where it has some, mass and gravity where it has weight.
 
-        Errors: ValueError where a calibration has found a parameter that the robot has not.
+        Errors: ValueError where a calibration has found a parameter that the robot has not, or where a strip has less than `oval`.
         """
         stated = {p.name: p for p in self._of(robot, {name: getattr(self, name) for name in KINDS}) if p.std}
+        if self.oval >= (soft := robot.rod.softer_side):
+            raise ValueError(f"Uncertainty.oval is {self.oval}, more than the rod's softer side has, {soft:.2g} EI; state less")
         if self.found is None:
             return tuple(stated.values())
         every = every_parameter(robot)
@@ -197,7 +199,7 @@ class Uncertainty:
         found = []
         for p in self.parameters(robot):
             kind = p.name.split("_")[0]
-            far = FAR if kind == "oval" and FAR * p.std <= MOST_SHARE else NEAR
+            far = FAR if kind == "oval" and FAR * p.std <= MOST_SHARE * robot.rod.softer_side else NEAR
             found.append(far if kind in OF_STIFFNESS and p.std > WIDE else 0.0)
         return tuple(found)
 

@@ -99,4 +99,4 @@ they are. A registration error is told where estimating one explains the markers
 contact; with `auto` also where it explains them with fewer contacts than were chosen and a BIC lower by 10, because a base frame
 that is off passes for contacts near the base. Outliers are told where none of this explains the markers and a robust fit does,
 without a fifth of them at most. Where one parameter of the robot, or the arc lengths, would explain a shape better than all of
-this, the message names it (torchrod/analysis/suspects.py; of 40 shapes of a batch at most).""".splitlines()
+this, the message names it (torchrod/analysis/suspects.py; of 16 shapes of a batch at most).""".splitlines()
