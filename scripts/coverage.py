@@ -143,7 +143,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=500, help="of each kind")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
-    parser.add_argument("--forms", type=int, default=100, help="loads of each form for the bands of f(s); 0 for none")
+    parser.add_argument("--forms", type=int, default=60, help="loads of each form for the bands of f(s); 0 for none")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)  # before the work that would be lost
