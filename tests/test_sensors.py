@@ -301,14 +301,21 @@ QUICK = (
 
 @pytest.mark.parametrize("name", some(*QUICK))
 def test_the_spread_is_the_cramer_rao_bound(name):
-    """Without noise: the truth is found, and force and place are as uncertain as differences of the forward solve say, to 5 %."""
+    """Without noise: the truth is found, and force and place are as uncertain as differences of the forward solve say, to 5 %.
+
+    Of a robot that is only nearly known the prior holds the answer back, by less than two deviations.
+    """
     case = study.CASES[name]()
     push = case.pushes(3, 1)
     fit = estimate(case.problem(push))
     assert fit.accepted.all()
-    assert (fit.location[:, 0] - push.place).abs().max() < 5e-4
-    assert (fit.force[:, 0] - push.force).norm(dim=-1).max() < 2e-3
     C = case.bound(push)
+    off = (fit.location[:, 0] - push.place).abs(), (fit.force[:, 0] - push.force).norm(dim=-1)
+    if case.stiffness:
+        std = C[:, 2, 2].sqrt(), C[:, :2, :2].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+        assert all(bool((away < 2 * s).all()) for away, s in zip(off, std, strict=True))
+    else:
+        assert off[0].max() < 5e-4 and off[1].max() < 2e-3
     n = 3
     spread = fit.load_covariance[:, 0, :n, :n].diagonal(dim1=-2, dim2=-1)
     assert ((spread / C[:, :n, :n].diagonal(dim1=-2, dim2=-1)).sqrt() - 1).abs().max() < 0.05
@@ -338,7 +345,7 @@ def test_coverage(name):
     assert found.accepted > 0.97
     for of in (found.force, found.place):
         assert 0.8 < of.over_bound < 1.2
-        assert abs(of.spread - 1) < 0.05
+        assert abs(of.spread - 1) < 0.1, "a few pushes that hardly show have most of the mean: 2 % off with 500"
         assert min(of.covered, of.drawn) > 0.87, "95 % less four standard errors of so many pushes"
 
 
