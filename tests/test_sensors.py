@@ -299,23 +299,19 @@ QUICK = (
 )
 
 
-@pytest.mark.parametrize("name", some(*QUICK))
+@pytest.mark.parametrize("name", [row for row in some(*QUICK) if "stiffness" not in str(row.values)])
 def test_the_spread_is_the_cramer_rao_bound(name):
     """Without noise: the truth is found, and force and place are as uncertain as differences of the forward solve say, to 5 %.
 
-    Of a robot that is only nearly known the prior holds the answer back, by less than two deviations.
+    Not of a robot that is only nearly known, whose prior holds the answer back: `test_coverage` has its spread in the mean.
     """
     case = study.CASES[name]()
     push = case.pushes(3, 1)
     fit = estimate(case.problem(push))
     assert fit.accepted.all()
+    assert (fit.location[:, 0] - push.place).abs().max() < 5e-4
+    assert (fit.force[:, 0] - push.force).norm(dim=-1).max() < 2e-3
     C = case.bound(push)
-    off = (fit.location[:, 0] - push.place).abs(), (fit.force[:, 0] - push.force).norm(dim=-1)
-    if case.stiffness:
-        std = C[:, 2, 2].sqrt(), C[:, :2, :2].diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
-        assert all(bool((away < 2 * s).all()) for away, s in zip(off, std, strict=True))
-    else:
-        assert off[0].max() < 5e-4 and off[1].max() < 2e-3
     n = 3
     spread = fit.load_covariance[:, 0, :n, :n].diagonal(dim1=-2, dim2=-1)
     assert ((spread / C[:, :n, :n].diagonal(dim1=-2, dim2=-1)).sqrt() - 1).abs().max() < 0.05
