@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torchrod.analysis.averaging import ONE_MORE, average
 from torchrod.analysis.count import selection
 from torchrod.cli import main
 from torchrod.estimation.draws import posterior_draws
+from torchrod.estimation.intervals import quantiles, resultant
 from torchrod.util.precision import DTYPE
 
 L, NOISE = 0.4, 1e-3
@@ -49,6 +51,44 @@ def test_probabilities_are_those_of_the_evidence():
     assert torch.equal(found.evidence.choice, by_hand.argmax(-1))
     assert found.evidence.something is not None and torch.allclose(found.evidence.something, p[:, 1])
     assert int(((p[:, 1] > 0.1) & (p[:, 1] < 0.9)).sum()) >= 2  # of some it is open
+
+
+def test_a_resultant_is_averaged_by_the_evidence_alone():
+    """By hand: a load that is not worth reporting may be there, and counts as much as the readings speak for it."""
+    problem, _ = posed(8, 1, (0.002, 0.02))
+    candidates = contact_hypotheses(problem)[:2]
+    found = average(problem, candidates, selection(problem, candidates))
+    R, weight, evidence = [], [], []
+    for candidate in candidates:
+        own = problem.of(candidate.unknowns)
+        draws = posterior_draws(own, selection(problem, [candidate]).fit)
+        R.append(resultant(own, draws.x))
+        weight.append(draws.weight)
+        evidence.append(draws.log_evidence)
+
+    def mixed(rarer: float) -> torch.Tensor:
+        share = torch.softmax(torch.stack(evidence, -1) + T([0.0, math.log(rarer)]), -1)
+        return quantiles(torch.cat(R, 1), torch.cat([w * share[:, h : h + 1] for h, w in enumerate(weight)], 1))
+
+    p = found.evidence.probability
+    assert p is not None
+    interval, open_to = found.intervals.resultant[:, :3], (p.amax(-1) < 0.9)
+    assert int(open_to.sum()) >= 2
+    off, rarer = ((interval - mixed(share))[open_to].abs().amax() for share in (1.0, ONE_MORE))
+    assert off < 0.02 < 0.1 < rarer, "N, of intervals of 1 N"
+
+
+def test_one_more_load_than_is_asked_for_is_tried_where_that_is_averaged():
+    """Of one push two, and of none nothing; only where it is to be thorough."""
+    problem, _ = posed(6, 3, (0.5, 1.0))
+    markers = problem.markers
+    assert markers is not None
+    still = Markers(S, markers.positions[:1] * 0 + torch.stack([0 * S, 0 * S, S], -1), NOISE)
+    candidates = contact_hypotheses(problem)[:4]
+    quick, thorough = (selection(problem, candidates, thorough=it) for it in (False, True))
+    assert set(thorough.fits[2][1].tolist()) == set(range(6)) > set(quick.fits.get(2, (None, T([])))[1].tolist())
+    assert len(thorough.fits.get(3, (None, T([])))[1]) < 3  # a third load only of those that ask for it
+    assert 2 not in selection(replace(problem, sensors=[still]), candidates, thorough=True).fits
 
 
 @pytest.mark.study

@@ -266,9 +266,9 @@ def test_a_push_across_a_strip_has_both_signs_unless_the_base_is_read():
     force, place = torch.stack([soft, across], -1), L * (0.5 + 0.3 * torch.rand(B, 1, generator=generator))
     s = torch.linspace(L / 20, L, 20)
     shape = solve_shape(robot, (PointForces(torch.nn.functional.pad(force, (0, 1)).unsqueeze(1), place),), None, s, B, steps=160)
-    p = shape.p + 1e-3 * L * torch.randn(shape.p.shape, generator=generator)
+    p = shape.p + 1e-4 * L * torch.randn(shape.p.shape, generator=generator)
     unknowns = Unknowns(GaussianCoordinates(1, L, scale, "point"))
-    markers = Markers(s, p, 1e-3 * L)
+    markers = Markers(s, p, 1e-4 * L)
     problem = Problem(robot, unknowns, [markers])
     found = analyze(problem, sampled=True)
     assert found.estimate.accepted.all() and found.intervals is not None
@@ -276,7 +276,9 @@ def test_a_push_across_a_strip_has_both_signs_unless_the_base_is_read():
     held = (low <= across) & (across <= high)
     told = torch.tensor([len(others) > 0 for others in found.diagnosis.others])
     assert held.double().mean() > 0.85
-    assert (low * high < 0).double().mean() > 0.85  # of a push that does not show at all, one broad fit has both signs
+    assert (
+        low * high < 0
+    ).double().mean() > 0.85  # 67 % of draws about one fit; a push that hardly shows has one broad fit for both
     assert told.double().mean() > 0.3
     assert bool((low * high < 0)[told].all())
     assert "measure the force under the base" in found.message(int(told.nonzero()[0]))

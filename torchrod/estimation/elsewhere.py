@@ -34,8 +34,7 @@ PLACES = (0.2, 0.4, 0.6, 0.8, 0.95)  # of the length
 AXIAL = (-1.5, -0.75, -0.3, 0.3)  # force scales
 MOST_FORCE = 3.0  # force scales: what (1) asks for at a place where it hardly tells the force
 FLAT = 100.0  # times as stiff to one side as to the other: a strip
-MOST_PUSHES = 2  # on a strip: with more, some of all their signs
-
+MOST_PUSHES = 2  # on a strip, all of whose signs are tried; of more, none
 
 Starts = Callable[[Problem, Float[Tensor, "B n"]], list[Float[Tensor, "B n"]]]
 Marks = Callable[[Problem, Float[Tensor, "... n"]], Float[Tensor, "... c"]]

@@ -165,7 +165,7 @@ class Uncertainty:
         Errors: ValueError where a calibration has found a parameter that the robot has not, or where a strip has less than `oval`.
         """
         stated = {p.name: p for p in self._of(robot, {name: getattr(self, name) for name in KINDS}) if p.std}
-        if self.oval >= (soft := robot.rod.softer_side):
+        if self.oval and self.oval >= (soft := robot.rod.softer_side):
             raise ValueError(f"Uncertainty.oval is {self.oval}, more than the rod's softer side has, {soft:.2g} EI; state less")
         if self.found is None:
             return tuple(stated.values())
