@@ -76,6 +76,10 @@ def test_a_resultant_is_averaged_by_the_evidence_alone():
     assert int(open_to.sum()) >= 2
     off, rarer = ((interval - mixed(share))[open_to].abs().amax() for share in (1.0, ONE_MORE))
     assert off < 0.02 < 0.1 < rarer, "N, of intervals of 1 N"
+    band = found.intervals.band
+    assert band is not None
+    nothing = ((band[:, :, :2, 0] <= 0) & (band[:, :, :2, 1] >= 0)).all(-1)
+    assert bool(nothing.any()) and bool((band[:, :, 2, 0][nothing] == 0).all()), "where f_x and f_y may be nothing, so may |f|"
 
 
 def test_one_more_load_than_is_asked_for_is_tried_where_that_is_averaged():
@@ -89,6 +93,8 @@ def test_one_more_load_than_is_asked_for_is_tried_where_that_is_averaged():
     assert set(thorough.fits[2][1].tolist()) == set(range(6)) > set(quick.fits.get(2, (None, T([])))[1].tolist())
     assert len(thorough.fits.get(3, (None, T([])))[1]) < 3  # a third load only of those that ask for it
     assert 2 not in selection(replace(problem, sensors=[still]), candidates, thorough=True).fits
+    told = analyze(problem, candidates, sampled=True).evidence
+    assert told is not None and bool(torch.isfinite(told.bic[:, 2]).all())
 
 
 @pytest.mark.study

@@ -26,6 +26,7 @@ from torchrod import (
     Shapes,
     Tendon,
     Tendons,
+    Uncertainty,
     Unknowns,
     analyze,
     contact_hypotheses,
@@ -34,6 +35,7 @@ from torchrod import (
     solve_shape,
     write_shapes,
 )
+from torchrod.analysis import suspects
 from torchrod.analysis.count import parts_of, select
 from torchrod.analysis.diagnosis import _misfit, _stretch
 from torchrod.cli import main
@@ -281,6 +283,22 @@ def test_what_is_off_of_the_robot_is_named(what, said):
     assert len(refused) > 8
     assert sum(any(words in found.message(b) for words in said) for b in refused) > 0.6 * len(refused)
     assert any(said[0] in found.message(b) for b in refused)
+
+
+def test_a_suspect_pays_for_what_its_fit_narrows_down(monkeypatch):
+    """(1) of analysis.suspects, by hand, of a bent rod; arc lengths pay ln(1 + a^2) for every marker."""
+    problem = off_by("set").take(torch.arange(4))
+    x, own = estimate(problem).x, problem.of(replace(problem.unknowns, uncertainty=Uncertainty(set=0.25)))
+    fit, at = estimate(own), own.state.parameters.at
+    by_hand = fit.chi2 + 3 * math.log(60) - torch.linalg.slogdet(fit.covariance[:, at, at])[1]
+    monkeypatch.setattr(suspects, "_along", lambda *_: 0.0)
+    monkeypatch.setattr(suspects, "suspects", lambda _: [suspects.Suspect("set", 0.25, str)])
+    score = suspects.suspected(problem, x, Settings()).score
+    assert fit.accepted.all() and torch.allclose(score, by_hand, atol=0.1)
+    markers = problem.markers
+    assert markers is not None
+    _, price = suspects._loose(problem, 2e-3)
+    assert torch.allclose(price, torch.full((4,), 20 * math.log(101.0)))
 
 
 def test_arc_lengths_that_are_off_are_told_in_a_base_frame_that_is_unknown():

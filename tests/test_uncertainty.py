@@ -367,6 +367,11 @@ def test_a_section_oval_in_any_direction():
         vars(off)["state"] = problem.exact.state
         true = off.h(plain, False)
         assert (problem.h(both, False) - true).norm() < 0.02 * (there - true).norm()
+        moved = problem.linearized(both)[1][..., problem.state.parameters.at]
+        for k, column in enumerate(moved.unbind(-1)):
+            step = torch.zeros(problem.size).index_fill(0, T([problem.state.parameters.at.start + k]).long(), 1e-4)
+            by_differences = (problem.h(both + step, False) - problem.h(both - step, False)) / 2e-4
+            assert torch.allclose(column, by_differences, rtol=1e-6, atol=1e-6 * float(column.abs().max()))
 
 
 def test_a_strip_that_is_oval_by_more_than_it_bears_is_refused_in_one_sentence():
