@@ -76,10 +76,6 @@ def test_a_resultant_is_averaged_by_the_evidence_alone():
     assert int(open_to.sum()) >= 2
     off, rarer = ((interval - mixed(share))[open_to].abs().amax() for share in (1.0, ONE_MORE))
     assert off < 0.02 < 0.1 < rarer, "N, of intervals of 1 N"
-    band = found.intervals.band
-    assert band is not None
-    nothing = ((band[:, :, :2, 0] <= 0) & (band[:, :, :2, 1] >= 0)).all(-1)
-    assert bool(nothing.any()) and bool((band[:, :, 2, 0][nothing] == 0).all()), "where f_x and f_y may be nothing, so may |f|"
 
 
 def test_one_more_load_than_is_asked_for_is_tried_where_that_is_averaged():

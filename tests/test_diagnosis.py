@@ -18,6 +18,8 @@ from torchrod import (
     GaussianCoordinates,
     Markers,
     PointForces,
+    PointWrenches,
+    Poses,
     Problem,
     Registration,
     Robot,
@@ -133,12 +135,25 @@ def test_arc_lengths_that_are_off_are_told_and_stated_they_are_accepted(tmp_path
     (tmp_path / "rod.toml").write_text(ROD)
     write_shapes(tmp_path / "s.csv", Shapes(study.s, wrong.positions, [str(b) for b in range(count)]))
     command = ["estimate", str(tmp_path / "rod.toml"), str(tmp_path / "s.csv"), "--noise", str(noise)]
+    assert main([*command, "--s-std", "3"]) == 2
+    assert "--s-std is 3 m on a rod of 0.4 m; it is in metres" in capsys.readouterr().err
     assert main([*command, "--s-std", "0.003"]) == 0
     assert f"{count} accepted" in capsys.readouterr().out
     q = solve_shape(steel_rod(), (one,), None, study.s, count).q
     write_shapes(tmp_path / "q.csv", Shapes(study.s, wrong.positions, [str(b) for b in range(count)], readings={"orientations": q}))
     assert main(["estimate", str(tmp_path / "rod.toml"), str(tmp_path / "q.csv"), "--noise", "0.01", "--s-std", "0.003"]) == 0
     assert "--s-std has no effect" in capsys.readouterr().err
+
+
+def test_a_pose_alone_leads_to_an_unknown_tip():
+    """Where one contact explains it, too."""
+    robot, at = steel_rod(), T([L])
+    push = PointWrenches(T([[[0.3, 0.1, 0.0]]]), torch.zeros(1, 1, 3), at)
+    tip = solve_shape(robot, (push,), None, at, 1)
+    problem = Problem(robot, unknowns_of(robot), [Poses(at, tip.p, tip.q, 1e-3, 0.01)])
+    found = analyze(problem)
+    assert found.estimate.accepted.all()
+    assert "try --contacts 0 --unknown-tip force" in found.message(0)
 
 
 @pytest.mark.many_fits

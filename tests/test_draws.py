@@ -115,6 +115,19 @@ def test_evidence_and_intervals_where_the_number_of_pushes_is_chosen():
     assert float(found.intervals.resultant[0].abs().max()) < 1e-2
 
 
+def test_the_size_of_a_load_that_may_be_nothing_may_be_nothing():
+    """Where the bands of f_x and f_y hold zero, that of |f| does, whose draws are never zero."""
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    push = tr.PointForces(T([[[0.7, 0.7, 0.0]], [[0.1, 0.0, 0.0]]]) * robot.rod.force_scale, T([[0.3], [0.1]]))
+    any_form = tr.SmoothCoordinates(0.4, robot.rod.force_scale, 1.0, 0.2)
+    problem = posed(s, tr.solve_shape(robot, (push,), None, s, 2).p, loads=any_form)
+    band = tr.sampled_intervals(problem, tr.estimate(problem)).band
+    assert band is not None
+    nothing = ((band[:, :, :2, 0] <= 0) & (band[:, :, :2, 1] >= 0)).all(-1)
+    assert bool(nothing.any(-1).all()) and not bool(nothing[0].all())
+    assert bool((band[:, :, 2, 0][nothing] == 0).all()) and bool((band[:, :, 2, 0][~nothing] > 0).all())
+
+
 def test_the_size_of_what_may_be_nothing_may_be_nothing():
     """Of draws about a vector that is measured: held in 95 % for zero, too, whose size quantiles of |v| never hold; and no wider
     where the vector is told from zero.

@@ -256,6 +256,6 @@ up a part of a load. Where a z-score is off by more than 5 %, and why:
   narrow one, whose force and place would be better known. With the deviations of a fit that ends at the truth it is 0.94 to 1.03,
   and the draws, which have every width in them, hold 92 to 96 %.
 - A ratio of a million, across: such a strip does not bend to a push across it. What shows is what it does to the other side, which
-  is alike for both signs: the fit's is a guess, and its deviation is about that one. Draws have both signs. They hold 90 to 92 %
-  there: pushes of this table are no stronger than a force scale, while a stronger push nearer the base would look alike.
-- Pushes known to 10 to 30 %, at a noise of a hundredth: the covariance is that of a linear model. The draws hold 93 to 97 %."""
+  is alike for both signs: the sign of the fit is a guess, and its standard deviation is about that sign only. The draws have both
+  signs and hold 92 to 93 %: the pushes here are no stronger than a force scale, while a stronger one nearer the base looks alike.
+- Pushes known to 10 to 30 %, at a noise of a hundredth: the covariance is that of a linear model. The draws hold 93 to 99 %."""
