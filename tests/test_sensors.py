@@ -37,7 +37,7 @@ from torchrod import (
     kernel,
     solve_shape,
 )
-from torchrod.estimation.evaluator import KernelEvaluator, NearlyKnownEvaluator, SensorEvaluator, TorchEvaluator, evaluator
+from torchrod.estimation.evaluator import KernelEvaluator, SensorEvaluator, TorchEvaluator, evaluator
 from torchrod.model.sensors import RodState
 
 P, L = 6, 0.4
@@ -194,7 +194,7 @@ def test_the_kernel_is_the_torch_model_of_all_sensors_at_once(loads, nearly):
     sensors.append(markers(torch.zeros(2, P, 3), s_std=0.01 * S))
     problem = Problem(rubbing(), Unknowns(loads, "wrench", uncertainty=nearly), sensors, T([[3.0, 2.0], [1.0, 2.0]]), 10)
     fast, definition, x = evaluator(problem), TorchEvaluator(problem), somewhere(problem)
-    assert isinstance(fast, SensorEvaluator if nearly is None else NearlyKnownEvaluator)
+    assert isinstance(fast, SensorEvaluator)
     for mine, other in zip((*fast.linearized(x), fast.h(x)), (*definition.linearized(x), definition.h(x)), strict=True):
         assert (mine - other).abs().max() <= 1e-10 * other.abs().max()
 

@@ -43,7 +43,7 @@ MOST_PROFILES = 1000  # samples, where nobody says whether profiles are wanted: 
 MOST_DRAWN, MOST_READINGS = 100, 200  # samples, and numbers of each, that are drawn where torch works out what sensors read;
 MOST_RUBBING = 10  # where tendons rub as well: a second each
 ANGLE_NOISE = 0.01  # rad
-ROUGHLY = 0.15  # a share: what a polynomial in the error of a stiffness follows
+ROUGHLY = 0.15  # a share of EI: above it, intervals of a section that may be oval hold less than they say
 EXACT = (
     "The robot is taken as exact, its {parts} too. What is only nearly known passes for a load; state it under [uncertainty] of "
     "ROBOT.toml, or calibrate it."
@@ -143,7 +143,7 @@ def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
     if options.intervals == "sampled" or not quick:
         return options.intervals == "sampled"
     plain = kernel_serves(problem) and not (problem.state.tip.size or problem.state.tension.size)
-    most = MOST_DRAWN if problem.robot.tendons.friction is None else MOST_RUBBING
+    most = MOST_DRAWN if problem.on_grid.tendons.friction is None else MOST_RUBBING
     few = problem.batch <= MOST_PROFILES if plain else problem.batch <= most and len(problem.groups) <= MOST_READINGS
     if not few:
         warnings.warn(
@@ -194,13 +194,12 @@ def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shap
             stacklevel=2,
         )
     own = nearly.of_a_sample
-    for kind in ("stiffness", "oval"):
-        if own is not None and getattr(own, kind) > ROUGHLY:
-            warnings.warn(
-                f"{options.robot}: uncertainty: {kind} is {getattr(own, kind):g}; above {ROUGHLY:g} intervals are too narrow now "
-                "and then, so calibrate the robot",
-                stacklevel=2,
-            )
+    if own is not None and own.oval > ROUGHLY:
+        warnings.warn(
+            f"{options.robot}: uncertainty: oval is {own.oval:g}; above {ROUGHLY:g} intervals are too narrow now and then, so "
+            "calibrate the robot",
+            stacklevel=2,
+        )
     if options.s_std is not None:
         positive("--s-std", options.s_std)
         in_metres("--s-std", options.s_std, rod.length)

@@ -48,7 +48,8 @@ def at_rest(problem: Problem, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, 
     light = smooth and problem.robot.gravity.ndim == 1 and math.isfinite(_weight(problem.robot))
     if light and family_of(plain) != "point" and kernel_walks(plain):
         increments = _increments(problem.robot) if q_tip is None else 1
-        wrench, missed, p = Walk(plain).balance(gamma, q_tip, increments, ROUGH_TOLERANCE)
+        x = plain.state.join(gamma, gamma.new_zeros(B, 6))
+        wrench, missed, p = Walk(plain).balance(x, q_tip, increments, ROUGH_TOLERANCE)
         settled = (missed <= ROUGH_TOLERANCE) & torch.isfinite(wrench).all(-1)
     if bool(settled.all()):
         return Rest(wrench, p)

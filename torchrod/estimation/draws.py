@@ -33,7 +33,7 @@ from ..util.threads import one_thread
 from . import filter as ekf
 from .chart import FAINT, Chart
 from .elsewhere import across_strip, elsewhere, fits_elsewhere
-from .evaluator import Evaluator, KernelEvaluator, SensorEvaluator, evaluator
+from .evaluator import Evaluator, KernelEvaluator, MisreadEvaluator, SensorEvaluator, evaluator
 from .pareto import GOOD, effective_size, smoothed
 from .result import Estimate
 from .solve import Settings, solver_of
@@ -207,11 +207,11 @@ class _Target:
         self.follow = follow.nan_to_num(0.0)  # d alpha / dy along the equilibria near the fit
         self._spread: tuple[Int[Tensor, " b"], int, Chart, Evaluator] | None = None
         state, robot = problem.state, problem.robot
-        smooth = robot.tendons.friction is None
+        smooth = self.problem.on_grid.tendons.friction is None
         self.walks = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and smooth
         self.q_tip = None if robot.weightless or not self.walks else self.problem.shape(x, differentiable=False).tip_q
         markers = self.problem.markers
-        plain = markers is not None and markers.isotropic and markers.offsets is None and self.problem.warp is None
+        plain = markers is not None and markers.isotropic and markers.offsets is None
         self.bare = plain and math.isinf(nu) and not (state.registration.size or state.parameters.size)
         least = float(self.problem.weights[:, :-TIP_ROWS].max()) ** -0.5 / robot.rod.length if plain else 0.0
         self.clamped = max(CLAMPED * least, LEAST_CLAMPED)
@@ -230,7 +230,7 @@ class _Target:
         chart, evaluate = self._of(index, D)
         y, log_volume = chart.back(v)
         flat, rows = y.flatten(0, 1), index.repeat_interleave(D)
-        by_walks = self.walks and isinstance(evaluate, KernelEvaluator | SensorEvaluator)
+        by_walks = self.walks and isinstance(evaluate, KernelEvaluator | SensorEvaluator | MisreadEvaluator)
         cost, x = self._by_walks(evaluate, flat, rows) if by_walks else self._by_newton(evaluate, flat, rows)
         cost, x = cost.unflatten(0, (b, D)), x.unflatten(0, (b, D))
         if by_walks and not self.bare:
@@ -245,9 +245,10 @@ class _Target:
         self, evaluate: Evaluator, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
         """The cost, by the forward solve from tip to base: one walk without weight. With the fit's prior, but where bare."""
-        assert isinstance(evaluate, KernelEvaluator | SensorEvaluator)
+        assert isinstance(evaluate, KernelEvaluator | SensorEvaluator | MisreadEvaluator)
         state, q_tip = self.problem.state, None if self.q_tip is None else self.q_tip[rows]
-        wrench, missed, line = evaluate.walk.balance(y[:, state.loads.at].contiguous(), q_tip, 1, self.clamped)
+        x = torch.nn.functional.pad(y, (0, state.base.size))
+        wrench, missed, line = evaluate.walk.balance(x, q_tip, 1, self.clamped)
         x = torch.cat([y, wrench / state.base.unit], -1)
         if not self.bare:
             return torch.where(missed <= self.clamped, evaluate.cost(x), torch.inf), x

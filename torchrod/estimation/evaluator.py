@@ -18,7 +18,6 @@ from torch import Tensor
 from .. import kernel
 from ..mechanics.jacobian import moved_along
 from ..model.problem import TIP_ROWS, Problem
-from ..model.uncertainty import Warp, near_zero
 from . import filter as ekf
 from .walk import Walk, kernel_serves, kernel_walks
 
@@ -101,13 +100,12 @@ def evaluator(problem: Problem, nu: float = math.inf) -> Evaluator:
 
 
 def _made(problem: Problem, nu: float) -> Evaluator:
-    if problem.state.parameters.size:
-        return NearlyKnownEvaluator(problem, nu) if kernel_walks(problem.exact) else TorchEvaluator(problem, nu)
-    return _of_known(problem, nu) if kernel_walks(problem) else TorchEvaluator(problem, nu)
-
-
-def _of_known(problem: Problem, nu: float) -> "KernelEvaluator | SensorEvaluator":
-    return KernelEvaluator(problem, nu) if kernel_serves(problem) else SensorEvaluator(problem, nu)
+    if not kernel_walks(problem):
+        return TorchEvaluator(problem, nu)
+    if kernel_serves(problem):
+        return KernelEvaluator(problem, nu)
+    markers = problem.markers
+    return (SensorEvaluator if markers is None or not markers.isotropic else MisreadEvaluator)(problem, nu)
 
 
 @dataclass(frozen=True)
@@ -201,7 +199,7 @@ class KernelEvaluator:
 
     def cost(self, x: Float[Tensor, "B n"]) -> Float[Tensor, " B"]:
         """See Evaluator."""
-        t = self.tables(x)  # which must outlive the call: the structure holds bare addresses
+        t = self.walk.tables(x, slopes=False)  # which must outlive the call: the structure holds bare addresses
         return kernel.cost_now(x, self.problem.mean, self.problem.precision, t.structure)
 
     def sums(self, x: Float[Tensor, "B n"]) -> kernel.Sums:
@@ -215,7 +213,7 @@ class KernelEvaluator:
 
     def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
         """See Problem."""
-        t = self.tables(x)
+        t = self.walk.tables(x, slopes=False)
         return kernel.measured_now(x, t.structure, t.markers, slopes=False)[0]
 
     def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
@@ -282,59 +280,42 @@ class SensorEvaluator(TorchEvaluator):
 
 
 @dataclass(frozen=True)
-class NearlyKnownEvaluator(TorchEvaluator):
-    """A robot with parameters that are only nearly known, by the kernel for each of the robots near it (model.uncertainty)."""
+class MisreadEvaluator(TorchEvaluator):
+    """Isotropic markers of which it is only nearly known how they are measured: where they are by the kernel, the rest by torch."""
 
     @cached_property
-    def _exact(self) -> KernelEvaluator | SensorEvaluator:
-        return _of_known(self.problem.exact, self.nu)
+    def _plain(self) -> KernelEvaluator:
+        """Of where the markers are."""
+        return KernelEvaluator(self.problem, self.nu)
 
-    @cached_property
-    def _off(self) -> list[tuple[KernelEvaluator | SensorEvaluator, Warp | None]]:
-        """Of every robot nearby; the exact one's own where only the measurement of markers is off."""
-        if isinstance(self._exact, SensorEvaluator):
-            return [(SensorEvaluator(other, self.nu), None) for other in self.problem.off]  # which warp what they read
-        found = []
-        for other in self.problem.off:
-            plain = replace(other, warp=None)
-            vars(plain)["state"] = other.state
-            same = other.robot is self.problem.exact.robot
-            found.append((self._exact if same else KernelEvaluator(plain, self.nu), other.warp))
-        return found
+    @property
+    def walk(self) -> Walk:
+        """The rod by the kernel."""
+        return self._plain.walk
 
-    def take(self, index: Int[Tensor, " b"]) -> "NearlyKnownEvaluator":
+    def take(self, index: Int[Tensor, " b"]) -> "MisreadEvaluator":
         """The samples of an index."""
-        part = NearlyKnownEvaluator(self.problem.take(index), self.nu)
-        exact = self._exact.take(index)
-        off = [(exact if model is self._exact else model.take(index), warp) for model, warp in self._off]
-        vars(part)["_exact"], vars(part)["_off"] = exact, off
+        plain = self._plain.take(index)
+        part = MisreadEvaluator(plain.problem, self.nu)
+        vars(part)["_plain"] = plain
         return part
 
     def h(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B z"]:
         """See Problem."""
-        plain, theta = self.problem.without_parameters(x)
-        exact = self._exact.h(plain)
-        off = (_warped(exact if model is self._exact else model.h(plain), warp) for model, warp in self._off)
-        return near_zero(exact, off, theta, self.problem.wide)[0]
+        h, nearly = self._plain.h(x), self.problem.deviations
+        assert nearly is not None
+        measured = nearly.warp(x[:, self.problem.state.parameters.at])(h[:, :-TIP_ROWS].unflatten(-1, (-1, 3)))
+        return torch.cat([measured.flatten(-2), h[:, -TIP_ROWS:]], -1)
 
     def linearized(self, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
         """See Problem."""
-        plain, theta = self.problem.without_parameters(x)
-        exact, off = self._exact.linearized(plain), []
-        for model, warp in self._off:
-            h, H = exact if model is self._exact else model.linearized(plain)
-            off.append((_warped(h, warp), H if warp is None else _warped(H.mT, replace(warp, shift=0 * warp.shift)).mT))
-        return self.problem.with_parameters(exact, off, theta)
+        (h, H), nearly, at = self._plain.linearized(x), self.problem.deviations, self.problem.state.parameters.at
+        assert nearly is not None
+        warp, p = nearly.warp(x[:, at]), h[:, :-TIP_ROWS].unflatten(-1, (-1, 3))
+        slopes = warp.matrix.unsqueeze(1) @ H[:, :-TIP_ROWS].unflatten(1, (-1, 3))
+        slopes[..., at] += warp.slopes(p) @ nearly.warp_root
+        return torch.cat([warp(p).flatten(-2), h[:, -TIP_ROWS:]], -1), torch.cat([slopes.flatten(1, 2), H[:, -TIP_ROWS:]], 1)
 
     def line(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B P 3"]:
-        """The centre line (m) of the robot as the file has it."""
-        plain, _ = self.problem.without_parameters(x)
-        return self._exact.line(plain)
-
-
-def _warped(rows: Float[Tensor, "... z"], warp: Warp | None) -> Float[Tensor, "... z"]:
-    """Rows of markers, with the tip residual behind them, as they are measured."""
-    if warp is None:
-        return rows
-    p = warp(rows[..., :-TIP_ROWS].unflatten(-1, (-1, 3)))
-    return torch.cat([p.flatten(-2), rows[..., -TIP_ROWS:]], -1)
+        """The centre line (m, the rod's own frame)."""
+        return self._plain.line(x)

@@ -85,8 +85,8 @@ def of_sizes(vectors: Float[Tensor, "B D k d"], weight: Float[Tensor, "B D"], fl
 
 def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:
     """Of all loads on the rod (N, base frame): what the base carries, less the weight and what acts on the tip."""
-    state, robot = problem.state, problem.robot
-    return state.base.of(x)[..., :3] - state.tip_wrench(x)[..., :3] - robot.rod.mass * robot.gravity
+    state = problem.state
+    return state.base.of(x)[..., :3] - state.tip_wrench(x)[..., :3] - problem.own_weight(x)
 
 
 def intervals(draws: Draws) -> Intervals:

@@ -15,13 +15,13 @@ from ..mechanics.integrate import known
 from ..mechanics.loads import total
 from ..mechanics.section import Section
 from ..mechanics.statics import beyond_tip, grid_for, stage_table
-from ..mechanics.tendons import LEAK
+from ..mechanics.tendons import LEAK, SLACK
 from ..model.load_families import FourierCoordinates, GaussianCoordinates, PaperCoordinates, PointCoordinates, SmoothCoordinates
 from ..model.load_families.family import FAINT
-from ..model.problem import SLACK, TIP_ROWS, Problem
+from ..model.problem import TIP_ROWS, Problem
 from ..util.by_value import Kept, key
 
-_layouts = Kept(256)  # of every robot near one whose parameters are only nearly known, on two grids
+_layouts = Kept(256)
 
 
 def kernel_walks(problem: Problem) -> bool:
@@ -29,8 +29,8 @@ def kernel_walks(problem: Problem) -> bool:
 
     Nodes that move with a point load take along neither a section nor a curvature nor a routing that vary.
     """
-    robot, family = problem.robot, family_of(problem)
-    if problem.state.parameters.size or family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
+    robot, family = problem.on_grid, family_of(problem)
+    if family is None or robot.rod.K_se.ndim != 2 or len(robot.tendons) > kernel.MOST_TENDONS:
         return False
     if problem.state.tension.size and any(t.tension_gain != 1 for t in robot.tendons.tendons):
         return False  # the kernel adds an error of the tension, not of the reading
@@ -43,7 +43,12 @@ def kernel_walks(problem: Problem) -> bool:
 def kernel_serves(problem: Problem) -> bool:
     """Whether the kernel can do all of the fit: it walks the rod, and nothing but isotropic markers are read."""
     markers = problem.markers
-    return markers is not None and markers.isotropic and problem.warp is None and kernel_walks(problem)
+    return markers is not None and markers.isotropic and not misread(problem) and kernel_walks(problem)
+
+
+def misread(problem: Problem) -> bool:
+    """Whether how positions are measured is among what is only nearly known."""
+    return problem.deviations is not None and problem.deviations.seen
 
 
 def family_of(problem: Problem) -> str | None:
@@ -77,12 +82,28 @@ class Walk:
 
     @cached_property
     def moving(self) -> bool:
-        """Whether the tables depend on where x has come to: point loads at unknown places move the nodes."""
+        """Whether the tables depend on where x has come to: it moves the nodes, or the robot itself."""
+        return self._moves_nodes or self.problem.deviations is not None
+
+    @property
+    def _moves_nodes(self) -> bool:
+        """Whether there are point loads at unknown places."""
         return family_of(self.problem) == "point"
 
-    def tables(self, x: Float[Tensor, "B n"]) -> kernel.FitTables:
-        """What the kernel is handed, for all samples."""
-        return _tables(self.problem, self.nu, x) if self.moving else self._fixed
+    def tables(self, x: Float[Tensor, "B n"], slopes: bool = True) -> kernel.FitTables:
+        """What the kernel is handed, for all samples; slopes: to find how the readings move with x, too."""
+        tables = _tables(self.problem, self.nu, x) if self._moves_nodes else self._fixed
+        return self._off(tables, x, slopes)
+
+    def _off(self, tables: kernel.FitTables, x: Float[Tensor, "B n"], slopes: bool) -> kernel.FitTables:
+        """Of robots that are off by what x says."""
+        problem, nearly = self.problem, self.problem.deviations
+        if nearly is None or not nearly.counts.total:
+            return tables
+        theta = x[:, problem.state.parameters.at]
+        kappa, dkappa = nearly.amounts(theta, problem.tension), nearly.slopes(theta, problem.tension) if slopes else None
+        weight = nearly.weight(kappa) if self._moves_nodes and nearly.counts.weight else None
+        return tables.off_by(kappa, dkappa, weight)
 
     def states(
         self, x: Float[Tensor, "B n"], slopes: bool
@@ -90,19 +111,22 @@ class Walk:
         """The section's states [p (m), q, wrench (N, N m)] at problem.s and at the tip, in the rod's own frame, with Theta of every
         tendon where they rub; the tip residual c (N, N m), and where slopes are wanted how they move with x.
         """
-        tendons = self.problem.robot.tendons
+        tendons = self.problem.on_grid.tendons
         width = kernel.STATE + (0 if tendons.friction is None else len(tendons))
-        t = self.tables(x)  # which must outlive the call: the structure holds bare addresses
+        t = self.tables(x, slopes)  # which must outlive the call: the structure holds bare addresses
         h, H = kernel.measured_now(x, t.structure, t.markers, slopes, width)
         y, c = h[:, :-TIP_ROWS].unflatten(1, (-1, width)), h[:, -TIP_ROWS:]
         return (y, c, None, None) if H is None else (y, c, H[:, :-TIP_ROWS].unflatten(1, (-1, width)), H[:, -TIP_ROWS:])
 
     def balance(
-        self, gamma: Float[Tensor, "B g"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float
+        self, x: Float[Tensor, "B n"], q_tip: Float[Tensor, "B 4"] | None, increments: int, tolerance: float
     ) -> tuple[Float[Tensor, "B 6"], Float[Tensor, " B"], Float[Tensor, "B P 3"]]:
-        """The base wrench (N, N m) in equilibrium under gamma, how far the base is from its clamp (rad), the centre line (m)."""
-        x = self.problem.state.join(gamma, gamma.new_zeros(len(gamma), 6))
-        t = _tables(self.problem, self.nu, x if self.moving else None, readings=False)
+        """The base wrench (N, N m) in equilibrium under x, how far the base is from its clamp (rad), the centre line (m).
+
+        The base wrench that x has plays no part.
+        """
+        t = _tables(self.problem, self.nu, x if self._moves_nodes else None, readings=False)
+        t = self._off(t, x, False)
         return kernel.balance_now(x, q_tip, increments, tolerance, t.structure, t.markers)
 
 
@@ -147,7 +171,7 @@ def _grid_at(problem: Problem, x: Float[Tensor, "B n"] | None) -> Grid:
     """The grid, of each sample its own where x moves the nodes."""
     family = problem.unknowns.loads
     gamma = family.start().unsqueeze(0) if x is None else x[:, problem.state.loads.at]
-    grid = grid_for(problem.robot, family.loads(gamma) if gamma.shape[-1] else (), problem.s, problem.steps)
+    grid = grid_for(problem.on_grid, family.loads(gamma) if gamma.shape[-1] else (), problem.s, problem.steps)
     return Grid(grid.nodes[0], grid.outputs[0]) if x is None and grid.nodes.ndim == 2 else grid
 
 
@@ -182,7 +206,7 @@ def _units(problem: Problem) -> dict[str, float]:
 
 def _layout(problem: Problem, x: Float[Tensor, "B n"] | None = None) -> Layout:
     """The robot, its loads and its markers on the grid, with nodes as x has them where it moves them."""
-    robot, c, family, state = problem.robot, problem.unknowns.loads, family_of(problem), problem.state
+    robot, c, family, state = problem.on_grid, problem.unknowns.loads, family_of(problem), problem.state
     assert family is not None
     grid, s = _grid_at(problem, x), problem.s
     section, table = Section.of(robot.rod.K_se, robot.rod.K_bt), stage_table(robot, (), None, grid)
@@ -215,6 +239,14 @@ def _layout(problem: Problem, x: Float[Tensor, "B n"] | None = None) -> Layout:
         "tensions": state.tension.size,
         "registration": int(state.registration.size > 0),
     }
+    if (nearly := problem.deviations) is not None:
+        along = nearly.along(grid)
+        u_star, hanging = (None if x is None else x.movedim(0, d) for x, d in ((along.u_star, -4), (along.hanging, -3)))
+        tensors |= {"K_off": along.K, "u_off": u_star, "hangs": hanging, "pulling": along.pulling}
+        own |= nearly.counts.of_kernel
+        own["parameters"] = state.parameters.size if nearly.counts.total else 0
+        if along.K is not None:  # none of what is off the diagonals of K_se and K_bt
+            counts["diagonal"] &= int(not along.K[..., [1, 2, 3, 5, 6, 7, 10, 11, 12, 14, 15, 16]].any())
     # Copies: what is kept must not change with the tensors that it was worked out from.
     tensors = {name: None if x is None else x.clone() for name, x in tensors.items()}
     return Layout(tensors, counts | loads | own, _units(problem), active)

@@ -23,6 +23,7 @@ GROUPS = 4  # of lanes that are worth a thread
 MOST_TENDONS = 16
 STATE = 13  # of a section: p, q and the wrench of mechanics.section (1)
 OUT = 4  # outputs of a perceptron's layer that are summed at a time
+OFF = "parameters", "stiffness", "curvature", "hanging", "pulls", "frictions", "places"  # counts of how robots are off
 FAMILIES = {"none": 0, "gaussian": 1, "paper": 2, "point": 3, "linear": 4}
 _I, _D, _P = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -39,6 +40,15 @@ class CPlaces(ctypes.Structure):
     _fields_ = CTable._fields_
 
 
+class CDeviations(ctypes.Structure):
+    """How the robot of every sample is off."""
+
+    _fields_ = [
+        *((n, _I) for n in OFF),
+        *((n, CTable) for n in ("kappa", "dkappa", "K_off", "u_off", "hangs", "pulling")),
+    ]
+
+
 class CKnown(ctypes.Structure):
     """The robot on its grid."""
 
@@ -49,6 +59,7 @@ class CKnown(ctypes.Structure):
         ("friction", _P),
         ("at", CPlaces),
         ("outputs", _I),
+        ("off", CDeviations),
     ]
 
 
@@ -122,7 +133,7 @@ class CPerceptron(ctypes.Structure):
     _fields_ = [("depth", _I), ("sizes", _P), ("weights", _P)]
 
 
-STRUCTURES = (CTable, CPlaces, CKnown, CLoads, CTask, CFilter, CSums, CCourse, CMarch, CPerceptron)
+STRUCTURES = (CTable, CPlaces, CDeviations, CKnown, CLoads, CTask, CFilter, CSums, CCourse, CMarch, CPerceptron)
 CONSTANTS = {"MOST_TENDONS": MOST_TENDONS, "STATE": STATE, "OUT": OUT} | FAMILIES
 FUNCTIONS: dict[str, tuple[type, ...]] = {
     "torchrod_march": (_P, _I),
@@ -204,6 +215,7 @@ def available() -> bool:
 SHARED_DIMENSIONS = {
     **{"K_se": 4, "K_bt": 4, "K_se_inverse": 4, "K_bt_inverse": 4},
     **{"h": 1, "Gm": 3, "Wn": 3, "Wm": 3, "u_star": 3, "L": 5, "dr": 4, "ddr": 4, "chord": 4, "tau": 3},
+    **{"kappa": 1, "dkappa": 2, "K_off": 4, "u_off": 4, "hangs": 3, "pulling": 3},
     **{"at": 1, "s": 2, "inside": 2, "node": 1, "weight": 1, "active": 3, "mean": 1, "precision": 1},
 }
 # What the kernel reads and writes at an address: double, but for these.
@@ -244,7 +256,7 @@ def _fill(structure: Any, tensors: Mapping[str, Tensor | None], numbers: Mapping
         elif issubclass(kind, ctypes.Structure):
             _fill(getattr(structure, name), tensors, numbers)
         else:
-            value = numbers[name]
+            value = numbers.get(name, 0) if name in OFF else numbers[name]
             setattr(structure, name, value if kind is _D else int(value))
 
 
@@ -333,6 +345,22 @@ class FitTables:
         rows = {name: None if x is None else x.contiguous() for name, x in (("positions", positions), ("w", w))}
         copy = CTask.from_buffer_copy(self.structure)
         copy.positions, copy.w, copy.robust = (_pointer(rows["positions"], "positions"), _pointer(rows["w"], "w"), nu)
+        return FitTables(copy, self.markers, self.held | rows)
+
+    def off_by(
+        self, kappa: Float[Tensor, "B m"], dkappa: Float[Tensor, "B m k"] | None, weight: Float[Tensor, "B 3"] | None
+    ) -> "FitTables":
+        """The same of robots that are off by kappa (model.deviations), which moves so with the parameters: a copy of the structure.
+
+        weight: of the rod per metre (N/m), where it is not that of the tables.
+        """
+        rows = {"kappa": kappa.contiguous(), "dkappa": None if dkappa is None else dkappa.contiguous()}
+        copy = CTask.from_buffer_copy(self.structure)
+        for name, x in rows.items():
+            setattr(copy.known.off, name, _table(x, name))
+        if weight is not None:
+            rows["weight"] = weight.contiguous()
+            copy.weight = _table(rows["weight"], "weight")
         return FitTables(copy, self.markers, self.held | rows)
 
 

@@ -38,9 +38,11 @@ inline std::string structures_and_constants() {
 #define END }); }
     BEGIN(Table) F(data), F(stride) END
     BEGIN(Places) F(data), F(stride) END
+    BEGIN(Deviations) F(parameters), F(stiffness), F(curvature), F(hanging), F(pulls), F(frictions), F(places), F(kappa), F(dkappa), F(K_off),
+        F(u_off), F(hangs), F(pulling) END
     BEGIN(Known) F(steps), F(tendons), F(newton), F(diagonal), F(varying), F(K_se), F(K_bt), F(K_se_inverse), F(K_bt_inverse), F(h), F(Gm), F(Wn),
         F(Wm), F(u_star), F(L), F(dr), F(tau), F(ddr), F(chord),
-        F(friction), F(at), F(outputs) END
+        F(friction), F(at), F(outputs), F(off) END
     BEGIN(Loads) F(family), F(count), F(per_load), F(size), F(axial), F(length), F(force_scale), F(eps), F(beta1), F(beta2), F(friction), F(faint), F(locations),
         F(basis), F(s), F(inside), F(node) END
     BEGIN(Task) F(known), F(loads), F(size), F(tip), F(tensions), F(registration), F(force_unit), F(moment_unit), F(length_unit),

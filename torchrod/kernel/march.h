@@ -28,9 +28,10 @@ inline void rk4_step(const Group& g, V* y, int64_t i, bool reverse, Trace& t) {
         t.row[e] = 3 * i + order[e];
         if (e != 2) stage_of(g, t.row[e], stage);  // the middle serves twice
         const int64_t section = m.varying ? (e + 1) / 2 : 0;
-        if (m.varying && e != 2) stiffness_of(m, g.lanes, t.row[e], t.K[section]);
+        if (m.varying && e != 2) stiffness_of(g, t.row[e], t.K[section]);
         t.slope[e].K = &t.K[section];
         derivative(m, z, stage, t.k[e], t.slope[e]);
+        if (g.parameter_tangents) forced_by(g, t.row[e], z, stage, t.slope[e], g.forced + e * g.parameter_tangents * FORCED);
         if (e == 3) break;
         const V reach = (e < 2 ? 0.5 : 1.0) * t.h;
         for (int c = 0; c < STATE; c++) z[c] = y[c] + reach * t.k[e][c];
@@ -58,7 +59,7 @@ template <bool Plain, bool Moving, bool Rubbing> __attribute__((noinline)) void 
     for (int c = 0; c < STATE; c++) z[c] = dy[c], sum[c] = V{};
     for (int64_t c = STATE; c < width; c++) z[c] = dy[c], sum[c] = V{};
     for (int e = 0; e < 4; e++) {
-        Moves moves{g.local_slope(t.row[e], j), nullptr, -1};
+        Moves moves{g.local_slope(t.row[e], j), nullptr, -1, nullptr};
         V3 dWn;
         if (moved && m.Wn.data) {
             const double share = 0.5 * (t.row[e] % 3);
@@ -68,6 +69,7 @@ template <bool Plain, bool Moving, bool Rubbing> __attribute__((noinline)) void 
             moves.Wn = &dWn;
         }
         if (j >= g.load_tangents && j < g.load_tangents + g.tension_tangents) moves.tension = j - g.load_tangents;
+        if (g.is_parameter(j)) moves.forced = g.forced + (e * g.parameter_tangents + j - g.first_parameter()) * FORCED;
         slope<Plain, Rubbing>(m, t.slope[e], z, moves, dk);
         const double weight = e == 0 || e == 3 ? 1 : 2, reach = e < 2 ? 0.5 : 1;
         auto go = [&](int64_t c) {
@@ -105,8 +107,9 @@ template <class Arrive> void walk_in_own_frame(const Group& g, V* y, V* dy, bool
         body_step(g, y, i, reverse, step);
         for (int64_t j = 0; j < g.tangents; j++) {
             V* tangent = carried.data() + j * CARRIED;
-            if (j < g.load_tangents) body_tangent<true>(g, step, j, tangent);
-            else body_tangent<false>(g, step, j, tangent);
+            if (j < g.load_tangents) body_tangent<true, false>(g, step, j, tangent);
+            else if (g.is_parameter(j)) body_tangent<false, true>(g, step, j, tangent);
+            else body_tangent<false, false>(g, step, j, tangent);
         }
         arrive(reverse ? i : i + 1, [&] {
             rotation(y, R);
@@ -133,7 +136,7 @@ template <class Sink> void walk(const Group& g, V* y, V* dy, bool reverse, Sink 
     if (g.in_own_frame()) return walk_in_own_frame(g, y, dy, reverse, arrive);
     const bool plain = !m.tendons && !m.Wn.data && !m.Wm.data;
     static thread_local Trace trace;
-    if (!m.varying) stiffness_of(m, g.lanes, 0, trace.K[0]);
+    if (!m.varying) stiffness_of(g, 0, trace.K[0]);
     arrive(reverse ? m.steps : 0, [] {});
     for (int64_t n = 0; n < m.steps; n++) {
         const int64_t i = reverse ? m.steps - 1 - n : n;

@@ -5,13 +5,6 @@
 
 #include "tables.h"
 
-INLINE void inverse3(const V* A, V* R) {  // rows of R: cofactors of the columns of A
-    V c[9] = {A[4] * A[8] - A[7] * A[5], A[7] * A[2] - A[1] * A[8], A[1] * A[5] - A[4] * A[2],
-              A[5] * A[6] - A[8] * A[3], A[8] * A[0] - A[2] * A[6], A[2] * A[3] - A[5] * A[0],
-              A[3] * A[7] - A[6] * A[4], A[6] * A[1] - A[0] * A[7], A[0] * A[4] - A[3] * A[1]};
-    V one = 1.0 / (A[0] * c[0] + A[3] * c[1] + A[6] * c[2]);
-    for (int i = 0; i < 9; i++) R[i] = c[i] * one;
-}
 INLINE void product3(const V* P, const V* Q, V* R) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) R[3 * i + j] = P[3 * i] * Q[j] + P[3 * i + 1] * Q[3 + j] + P[3 * i + 2] * Q[6 + j];
@@ -115,6 +108,26 @@ inline void chord(const Stage& at, int64_t t, const V* x, V* g, V* dg) {
     }
 }
 
+// How the wrench of unit tension moves (6) where the tendon's place r does by `shift`, at given strains x. Zero chord: it follows the rod.
+INLINE void shifted(const Stage& at, int64_t t, bool chords, const V* x, const V3& shift, V* dg) {
+    const V* L = at.L + 18 * t;
+    const V3 u = part(x + 3), dr = part(at.dr + 3 * t), r{L[11], -L[5], V{}};
+    V3 T = dr;
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 6; j++) T.c[i] += L[6 * i + j] * x[j];
+    const V3 dT = cross(u, shift);
+    V3 along = T, q = r, d_along = dT, dq = shift;
+    if (chords) {
+        const V* c = at.chord + 4 * t;
+        const V3 a = cross(u, T + dr) + part(at.ddr + 3 * t), b = cross(u, a), da = cross(u, dT), db = cross(u, da);
+        along = along + c[1] * a + c[2] * b, q = q + c[0] * a + c[3] * b;
+        d_along = d_along + c[1] * da + c[2] * db, dq = dq + c[0] * da + c[3] * db;
+    }
+    const V per = 1.0 / root(dot(along, along));
+    const V3 d = per * along, dd = per * (d_along - dot(d, d_along) * d), d_arm = cross(dq, d) + cross(q, dd);
+    for (int i = 0; i < 3; i++) dg[i] = dd.c[i], dg[3 + i] = d_arm.c[i];
+}
+
 // tendons.py, chord_inverse: of a matrix that need not be symmetric, by blocks [[A, B], [C, D]].
 INLINE void chord_inverse(const V* J, V* inverse) {
     V A[9], B[9], C[9], D[9], Ainv[9], left[9], right[9], S[9], both[9], top[9];
@@ -158,8 +171,8 @@ inline void balance_chords(const Known& m, const Stiffness& K, const Stage& at, 
     }
 }
 
-// tendons.py, turning_rate: Theta' of tendon t, and how it moves with the strains x, (6).
-inline V turning_rate(const Stage& at, int64_t t, const V* x, V pull, double floor, V* slope) {
+// tendons.py, turning_rate: Theta' of tendon t, how it moves with the strains x, (6), and with where it is, (2).
+inline V turning_rate(const Stage& at, int64_t t, const V* x, V pull, double floor, V* slope, V* by_place) {
     const V* L = at.L + 18 * t;
     const V3 u = part(x + 3), dr = part(at.dr + 3 * t), change = cross(u, dr) + part(at.ddr + 3 * t);
     V3 along = dr;
@@ -178,12 +191,15 @@ inline V turning_rate(const Stage& at, int64_t t, const V* x, V pull, double flo
         for (int i = 0; i < 3; i++) sum += L[6 * i + j] * by_along.c[i];
         slope[j] = per_rate * sum;
     }
+    const V3 by_r = cross(by_along, u);  // along moves by u x dr
+    by_place[0] = per_rate * by_r.c[0], by_place[1] = per_rate * by_r.c[1];
     return there * rate;
 }
 
 // What the derivative of one evaluation of (1)-(4) needs of its values. Jv (3, 4): of R v by q; Jn, Jm: of R^T Wn and R^T Wm.
 struct Slope {
-    V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS], tau[MOST_TENDONS], fall[MOST_TENDONS], turn[MOST_TENDONS * 6];
+    V R[9], Jv[12], Jn[12], Jm[12], w, tau_unit[MOST_TENDONS], tau[MOST_TENDONS], fall[MOST_TENDONS], turn[MOST_TENDONS * 6], left[MOST_TENDONS],
+        aside[MOST_TENDONS * 2];
     V3 q, u, v, N, N_turning, M_turning;
     bool Jn_there, Jm_there;
     const Stiffness* K;
@@ -207,14 +223,14 @@ inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope
         const V w[6] = {s.N.c[0], s.N.c[1], s.N.c[2], M.c[0], M.c[1], M.c[2]};
         for (int64_t t = 0; t < m.tendons; t++) s.tau[t] = at.tau[t], s.tau_unit[t] = at.tau_unit[t];
         for (int64_t t = 0; m.friction && t < m.tendons; t++) {
-            const V left = exponential(larger(smaller(-m.friction[t] * y[STATE + t], splat(700.0)), splat(-700.0)));
-            s.tau[t] *= left, s.tau_unit[t] *= left, s.fall[t] = m.friction[t] * s.tau[t];
+            s.left[t] = exponential(larger(smaller(-at.mu[t] * y[STATE + t], splat(700.0)), splat(-700.0)));
+            s.tau[t] *= s.left[t], s.tau_unit[t] *= s.left[t], s.fall[t] = at.mu[t] * s.tau[t];
         }
         if (m.chord.data) balance_chords(m, *s.K, at, s.tau, w, s.balance);
         else balance(m, *s.K, at, s.tau, w, s.balance);
         s.v = part(s.balance.x), s.u = part(s.balance.x + 3);
         for (int64_t t = 0; m.friction && t < m.tendons; t++)
-            dy[STATE + t] = turning_rate(at, t, s.balance.x, s.tau[t], m.friction[m.tendons], s.turn + 6 * t);
+            dy[STATE + t] = turning_rate(at, t, s.balance.x, s.tau[t], m.friction[m.tendons], s.turn + 6 * t, s.aside + 2 * t);
     } else {
         s.v = matvec(s.K->se, s.N), s.u = at.u_star + matvec(s.K->bt, M);
         s.v.c[2] += 1.0;
@@ -234,12 +250,78 @@ inline void derivative(const Known& m, const V* y, const Stage& at, V* dy, Slope
     dy[6] = -0.5 * dot(s.q, s.u);
 }
 
-// What moves with one tangent at one stage, beside the state: the local loads [G, G2_x, G2_y], Wn, and the tension of one tendon.
+// What moves with one tangent at one stage, beside the state: the local loads [G, G2_x, G2_y], Wn, the tension of one tendon, and what
+// a parameter of the robot adds.
 struct Moves {
     const V* local;   // (5) or null
     const V3* Wn;     // or null
     int64_t tension;  // whose unknown this tangent is, or -1
+    const V* forced;  // (FORCED) or null
 };
+
+// What a parameter adds at one stage, by itself: to the section's wrench that the strains balance (6), to R^T Wn (3), to every Theta'.
+constexpr int FORCED = 9 + MOST_TENDONS;
+
+// For all parameters, (parameter_tangents, FORCED): the wrench of every amount kappa by the amount's own slopes. y: the state there.
+inline void forced_by(const Group& g, int64_t row, const V* y, const Stage& at, const Slope& s, V* to) {
+    const Known& m = *g.known;
+    const Deviations& d = m.off;
+    const int64_t n = g.parameter_tangents;
+    for (int64_t i = 0; i < n * FORCED; i++) to[i] = V{};
+    const auto add = [&](int64_t amount, const V* wrench) {
+        for (int64_t k = 0; k < n; k++) {
+            const V by = g.dkappa[amount * n + k];
+            if (any(by != 0.0))
+                for (int i = 0; i < 6; i++) to[k * FORCED + i] += by * wrench[i];
+        }
+    };
+    const V x[6] = {s.v.c[0], s.v.c[1], s.v.c[2], s.u.c[0], s.u.c[1], s.u.c[2]};
+    const V bent[6] = {x[0], x[1], x[2] - 1.0, x[3] - at.u_star.c[0], x[4] - at.u_star.c[1], x[5] - at.u_star.c[2]};
+    V f[6];
+    for (int64_t k = 0; k < d.stiffness; k++) {  // what is stiffer bears more
+        for (int i = 0; i < 6; i++) {
+            f[i] = V{};
+            for (int j = 0; j < 3; j++) f[i] -= off_stiffness(g, k, row, 3 * i + j) * bent[i < 3 ? j : 3 + j];
+        }
+        add(k, f);
+    }
+    for (int64_t k = 0; k < d.curvature; k++) {
+        V u[3];
+        for (int c = 0; c < 3; c++) u[c] = fetch(d.u_off, g.lanes, (k * 3 * m.steps + row) * 3 + c), f[c] = V{};
+        const V* K = s.K->K_bt;
+        for (int i = 0; i < 3; i++) f[3 + i] = K[3 * i] * u[0] + K[3 * i + 1] * u[1] + K[3 * i + 2] * u[2];
+        add(d.of_curvature() + k, f);
+    }
+    if (d.hanging) {
+        const V3 back = V3{} - s.q;
+        for (int64_t k = 0; k < n; k++) {
+            const V3 w = turned(back, s.w, splat(g.dead) * weight_slope(g, row, k));
+            for (int c = 0; c < 3; c++) to[k * FORCED + 6 + c] = w.c[c];
+        }
+    }
+    for (int64_t t = 0; t < m.tendons; t++) {
+        const V* unit = s.balance.g + 6 * t;
+        if (d.pulls) {
+            const V more = fetch(d.pulling, g.lanes, row * m.tendons + t) * (m.friction ? s.left[t] : splat(1.0));
+            for (int i = 0; i < 6; i++) f[i] = -more * unit[i];
+            add(d.of_pull() + t, f);
+        }
+        if (d.frictions) {
+            const V more = y[STATE + t] * s.tau[t];
+            for (int i = 0; i < 6; i++) f[i] = more * unit[i];
+            add(d.of_friction() + t, f);
+        }
+        for (int axis = 0; d.places && axis < 2; axis++) {
+            V3 shift{};
+            shift.c[axis] = splat(1.0);
+            shifted(at, t, m.chord.data, x, shift, f);
+            for (int i = 0; i < 6; i++) f[i] *= -s.tau[t];
+            const int64_t amount = d.of_place() + 2 * t + axis;
+            add(amount, f);
+            for (int64_t k = 0; m.friction && k < n; k++) to[k * FORCED + 9 + t] += g.dkappa[amount * n + k] * s.aside[2 * t + axis];
+        }
+    }
+}
 
 // The derivative of `derivative` along one tangent z of the state. Plain: no tendons and no loads of the base frame.
 // Rubbing: tendons with friction, whose Theta come behind the rest of the state.
@@ -254,6 +336,7 @@ template <bool Plain, bool Rubbing> INLINE void slope(const Known& m, const Slop
     V3 dN = dNt, dM = dMt, dv, du;
     if (!Plain) {
         if (moves.Wn) dN = dN + *moves.Wn;
+        if (moves.forced) dN = dN + part(moves.forced + 6);
         if (s.Jn_there) dN = dN + matvec4(s.Jn, z + 3);
         if (s.Jm_there) dM = dM + matvec4(s.Jm, z + 3);
     }
@@ -261,6 +344,7 @@ template <bool Plain, bool Rubbing> INLINE void slope(const Known& m, const Slop
         V dw[6] = {dN.c[0], dN.c[1], dN.c[2], dM.c[0], dM.c[1], dM.c[2]}, dx[6];
         if (moves.tension >= 0)
             for (int i = 0; i < 6; i++) dw[i] -= s.tau_unit[moves.tension] * s.balance.g[6 * moves.tension + i];
+        for (int i = 0; moves.forced && i < 6; i++) dw[i] += moves.forced[i];
         for (int64_t t = 0; Rubbing && t < m.tendons; t++) {
             const V less = s.fall[t] * z[STATE + t];
             for (int i = 0; i < 6; i++) dw[i] += less * s.balance.g[6 * t + i];
@@ -273,12 +357,16 @@ template <bool Plain, bool Rubbing> INLINE void slope(const Known& m, const Slop
         for (int64_t t = 0; Rubbing && t < m.tendons; t++) {
             V rate = V{};
             for (int i = 0; i < 6; i++) rate += s.turn[6 * t + i] * dx[i];
-            dk[STATE + t] = rate;
+            dk[STATE + t] = moves.forced ? rate + moves.forced[9 + t] : rate;
         }
-    } else if (m.diagonal) {
-        for (int i = 0; i < 3; i++) dv.c[i] = s.K->se[4 * i] * dN.c[i], du.c[i] = s.K->bt[4 * i] * dM.c[i];
     } else {
-        dv = matvec(s.K->se, dN), du = matvec(s.K->bt, dM);
+        V3 n = dN, b = dM;
+        if (moves.forced) n = n + part(moves.forced), b = b + part(moves.forced + 3);
+        if (m.diagonal) {
+            for (int i = 0; i < 3; i++) dv.c[i] = s.K->se[4 * i] * n.c[i], du.c[i] = s.K->bt[4 * i] * b.c[i];
+        } else {
+            dv = matvec(s.K->se, n), du = matvec(s.K->bt, b);
+        }
     }
     const V3 dq = part(z + 3), p = matvec(s.R, dv) + matvec4(s.Jv, z + 3), q = s.w * du + z[6] * s.u + cross(dq, s.u) + cross(s.q, du),
              N = cross(dNt, s.u) + cross(s.N_turning, du),

@@ -60,11 +60,49 @@ INLINE void add_skewed(const V* S, const V* d, V* to) {
 struct BodyStep {
     struct Stage {
         V NN[6], NM[6], MN[6], MM[6], C[9], D[9], F[9], share;
+        V3 u, v;
         int64_t row;
     } at[4];
     V Q[9];
     V3 P;
 };
+
+// A section's compliances, whose stiffness is diagonal.
+INLINE void compliance_of(const Group& g, int64_t row, V3& S, V3& B) {
+    const Known& m = *g.known;
+    if (g.kappa && !m.varying) {
+        S = part(g.compliance), B = part(g.compliance + 3);
+        return;
+    }
+    Stiffness K;
+    if (g.kappa) stiffness_of(g, row, K);
+    for (int k = 0; k < 3; k++) {
+        const int64_t at = 4 * k + (m.varying ? 9 * row : 0);
+        S.c[k] = g.kappa ? K.se[4 * k] : fetch(m.K_se_inverse, g.lanes, at);
+        B.c[k] = g.kappa ? K.bt[4 * k] : fetch(m.K_bt_inverse, g.lanes, at);
+    }
+}
+
+// What the parameters add to the wrench that the strains v, u balance, (parameter_tangents, FORCED), of whose numbers the first six:
+// `forced_by` of section.h where K is diagonal and nothing else is off.
+inline void forced_in_own_frame(const Group& g, int64_t row, const V3& v, const V3& u, const V3& u_star, const V3& B, V* to) {
+    const Known& m = *g.known;
+    const Deviations& d = m.off;
+    const int64_t n = g.parameter_tangents;
+    const V bent[6] = {v.c[0], v.c[1], v.c[2] - 1.0, u.c[0] - u_star.c[0], u.c[1] - u_star.c[1], u.c[2] - u_star.c[2]};
+    for (int64_t j = 0; j < n; j++)
+        for (int i = 0; i < 6; i++) to[j * FORCED + i] = V{};
+    for (int64_t k = 0; k < d.stiffness; k++)
+        for (int i = 0; i < 6; i++) {
+            const V f = off_stiffness(g, k, row, 4 * (i % 3) + 9 * (i / 3)) * bent[i];
+            for (int64_t j = 0; j < n; j++) to[j * FORCED + i] -= g.dkappa[k * n + j] * f;
+        }
+    for (int64_t k = 0; k < d.curvature; k++)
+        for (int c = 0; c < 3; c++) {
+            const V f = fetch(d.u_off, g.lanes, (k * 3 * m.steps + row) * 3 + c) / B.c[c];
+            for (int64_t j = 0; j < n; j++) to[j * FORCED + 3 + c] += g.dkappa[(d.of_curvature() + k) * n + j] * f;
+        }
+}
 
 // The four stages' values: the section's wrench and strains, the orientations e_i, and the wrench at the end.
 struct Stages {
@@ -85,6 +123,7 @@ INLINE void body_stages(const Group& g, V* y, const int64_t* row, V h, const V3*
             s.v[i].c[k] = S[i].c[k] * s.N[i].c[k] + (k == 2 ? 1.0 : 0.0);
             s.u[i].c[k] = B[i].c[k] * s.M[i].c[k] + at.u_star.c[k];
         }
+        if (const int64_t n = g.parameter_tangents) forced_in_own_frame(g, row[i], s.v[i], s.u[i], at.u_star, B[i], g.forced + i * n * FORCED);
         const V3 dN = cross(s.N[i], s.u[i]);
         V3 dM = cross(s.M[i], s.u[i]) + cross(s.N[i], s.v[i]);
         dM.c[0] += at.G.c[1], dM.c[1] -= at.G.c[0];
@@ -105,12 +144,8 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
     const int64_t first = reverse ? 2 : 0, row[4] = {3 * i + first, 3 * i + 1, 3 * i + 1, 3 * i + 2 - first};
     V3 S[4], B[4];
     for (int e = 0; e < 4; e++) {
-        const bool again = e == 2 || (e && !m.varying);
-        for (int k = 0; k < 3; k++) {
-            const int64_t at = 4 * k + (m.varying ? 9 * row[e] : 0);
-            S[e].c[k] = again ? S[e - 1].c[k] : fetch(m.K_se_inverse, g.lanes, at);
-            B[e].c[k] = again ? B[e - 1].c[k] : fetch(m.K_bt_inverse, g.lanes, at);
-        }
+        if (e != 2 && (!e || m.varying)) compliance_of(g, row[e], S[e], B[e]);
+        else S[e] = S[e - 1], B[e] = B[e - 1];
     }
     Stages s;
     body_stages(g, y, row, h, S, B, s);
@@ -143,7 +178,7 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
     const Quaternion b_[4] = {b1, b2, b3, Quaternion{}};
     for (int k = 0; k < 4; k++) {
         BodyStep::Stage& at = b.at[k];
-        at.row = row[k], at.share = k < 2 ? half : k == 2 ? h : sixth;
+        at.row = row[k], at.u = s.u[k], at.v = s.v[k], at.share = k < 2 ? half : k == 2 ? h : sixth;
         skewed(at.share, s.u[k], V3{}, V3{}, at.NN), skewed(at.share, V3{}, s.N[k], B[k], at.NM);
         skewed(at.share, s.v[k], s.N[k], S[k], at.MN), skewed(at.share, s.u[k], s.M[k], B[k], at.MM);
         between(back * s.e[k], g_[k], B[k], at.C), between(s.e[k], b_[k], B[k], at.D);
@@ -153,8 +188,9 @@ inline void body_step(const Group& g, V* y, int64_t i, bool reverse, BodyStep& b
     between(conjugate(turn), turn, V3{one, one, one}, b.Q);
 }
 
-// And of one tangent t = [dN~, dM~, theta, pi]; Loaded: it moves the local loads as well.
-template <bool Loaded> __attribute__((noinline)) void body_tangent(const Group& g, const BodyStep& b, int64_t j, V* t) {
+// And of one tangent t = [dN~, dM~, theta, pi]; Loaded: it moves the local loads as well. Forced: it is a parameter's, which adds to
+// what strains the section, not to the wrench itself.
+template <bool Loaded, bool Forced> __attribute__((noinline)) void body_tangent(const Group& g, const BodyStep& b, int64_t j, V* t) {
     V x[4][6], sum[6], z[6];
     for (int c = 0; c < 6; c++) z[c] = t[c], sum[c] = -t[c];
 #pragma GCC unroll 4
@@ -167,7 +203,14 @@ template <bool Loaded> __attribute__((noinline)) void body_tangent(const Group& 
             d[0] -= l[0], d[1] -= l[1], d[2] -= l[2], d[3] -= l[4], d[4] += l[3];
             z[3] += at.share * l[1], z[4] -= at.share * l[0];
         }
-        add_skewed(at.NN, d, z), add_skewed(at.NM, d + 3, z);
+        add_skewed(at.NN, d, z);
+        if (Forced) {  // d x u and d x v of the matrices are of the wrench alone
+            const V* f = g.forced + (k * g.parameter_tangents + j - g.first_parameter()) * FORCED;
+            const V3 more = cross(part(f), at.v) + cross(part(f + 3), at.u);
+            for (int c = 0; c < 3; c++) z[3 + c] -= at.share * more.c[c];
+            for (int c = 0; c < 6; c++) d[c] += f[c];
+        }
+        add_skewed(at.NM, d + 3, z);
         add_skewed(at.MN, d, z + 3), add_skewed(at.MM, d + 3, z + 3);
         if (k < 3)
             for (int c = 0; c < 6; c++) sum[c] += (k == 1 ? 2.0 : 1.0) * z[c];

@@ -62,7 +62,7 @@ struct Motion {
 
 // Room for one group, kept from group to group.
 struct Room {
-    std::vector<V> local, moves, rows, line, tension, tangents;
+    std::vector<V> local, moves, rows, line, tension, tangents, kappa, forced;
 };
 
 struct Measured {  // rows (Z, 1 + n): h, then dh/dx; line (P, 3): the centre line in the rod's own frame
@@ -77,9 +77,21 @@ template <class X> Group group_of(const Task& f, const Lanes& lanes, X x, bool s
     const int64_t g = f.loads.size;
     room.tension.resize(f.tensions);
     for (int64_t t = 0; t < f.tensions; t++) room.tension[t] = f.tension_unit * x(g + f.tip + t);
-    const int64_t tangents = slopes ? g + f.tensions + PLAIN : 0;
+    const int64_t parameters = slopes ? m.off.parameters : 0, tangents = slopes ? g + f.tensions + parameters + PLAIN : 0;
     Group group{&m, lanes, tangents, slopes ? g : 0, f.tensions, f.tension_unit, f.slack, f.leak, room.tension.data(), nullptr, nullptr, f.weight, f.active};
     group.turning = f.offsets || f.tip;
+    if (const int64_t amounts = m.off.size()) {
+        room.kappa.resize(amounts * (1 + m.off.parameters));
+        for (int64_t k = 0; k < amounts; k++) room.kappa[k] = fetch(m.off.kappa, lanes, k);
+        for (int64_t k = 0; slopes && k < amounts * m.off.parameters; k++) room.kappa[amounts + k] = fetch(m.off.dkappa, lanes, k);
+        group.kappa = room.kappa.data(), group.dkappa = group.kappa + amounts;
+        group.parameter_tangents = parameters;
+        Stiffness K;
+        if (!m.varying) stiffness_of(group, 0, K);
+        for (int k = 0; k < 3 && !m.varying; k++) group.compliance[k] = K.se[4 * k], group.compliance[3 + k] = K.bt[4 * k];
+        room.forced.resize(4 * parameters * FORCED);
+        group.forced = room.forced.data();
+    }
     if (f.loads.family == POINT && slopes) {
         room.moves.resize((m.steps + 1) * g);
         move_nodes(f.loads, group, x, room.moves.data());
@@ -103,7 +115,7 @@ template <class X> struct Show {
     const V *y, *dy;
 
     int64_t column(int64_t j) const {
-        const int64_t fixed = f.loads.size + f.tensions;
+        const int64_t fixed = f.loads.size + f.tensions + g.parameter_tangents;
         return j < f.loads.size ? j : j < fixed ? f.tip + j : f.size - PLAIN + j - fixed;
     }
     void put(Mask here, int64_t z, const V3& value) const {
@@ -187,7 +199,7 @@ inline int64_t rows_of(const Task& f, bool states) {
 // states of the sections, in the rod's own frame.
 template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool slopes, Room& room, bool states = false) {
     const Known& m = f.known;
-    const int64_t n = f.size, P = m.outputs - 1, fixed = f.loads.size + f.tensions;
+    const int64_t n = f.size, P = m.outputs - 1;
     const int64_t width = slopes ? 1 + n : 1;
     const int64_t Z = rows_of(f, states);
     room.rows.assign(Z * width, V{});
@@ -208,11 +220,16 @@ template <class X> Measured measure(const Task& f, const Lanes& lanes, X x, bool
     y[6] = splat(1.0);
     const int64_t stride = m.width();
     room.tangents.assign(g.tangents * stride, V{});
+    const V3 weight = m.Wn.data ? weight_at(g, 0) : V3{};
     for (int i = 0; i < 6; i++) {
         const double unit = i < 3 ? f.force_unit : f.moment_unit;
         y[7 + i] = unit * x(n - PLAIN + i);
-        if (i < 3 && m.Wn.data) y[7 + i] -= fetch(m.Wn, g.lanes, i);
-        if (slopes) room.tangents[(fixed + i) * stride + 7 + i] = splat(unit);
+        if (i < 3) y[7 + i] -= weight.c[i];
+        if (slopes) room.tangents[(g.tangents - PLAIN + i) * stride + 7 + i] = splat(unit);
+    }
+    for (int64_t k = 0; m.off.hanging && k < g.parameter_tangents; k++) {
+        const V3 more = weight_slope(g, 0, k);
+        for (int c = 0; c < 3; c++) room.tangents[(g.first_parameter() + k) * stride + 7 + c] = V{} - more.c[c];
     }
     const Show<X> show{f, g, x, motion, to, y, room.tangents.data()};
     walk(g, y, room.tangents.data(), false, [&](int64_t p, Mask here) {

@@ -84,7 +84,7 @@ Balanced balanced(const Task& f, const Lanes& lanes, X x, const V* q_tip, int64_
     // In the frame of the base's own section, which is the base frame to within the tolerance.
     const V3 back = V3{} - part(y + 3);
     V3 n = part(y + 7);
-    if (dead) n = n + turned(back, y[6], {fetch(f.known.Wn, lanes, 0), fetch(f.known.Wn, lanes, 1), fetch(f.known.Wn, lanes, 2)});
+    if (dead) n = n + turned(back, y[6], weight_at(g, 0));
     for (int i = 0; i < 3; i++) b.wrench[i] = n.c[i], b.wrench[3 + i] = y[10 + i];
     for (int64_t p = 0; p < f.known.outputs; p++) {
         const V3 at = turned(back, y[6], part(room.line.data() + 3 * p) - part(y));

@@ -80,6 +80,7 @@ class StageTable:
                 L=function(t.L, 3),
                 dr=function(t.dr, 2),
                 tau=function(t.tau),
+                friction=t.friction if t.friction is None or t.friction.ndim == 1 else function(t.friction),
                 ddr=None if t.ddr is None else function(t.ddr, 2),
                 chord=None if t.chord is None else function(t.chord, 2),
             ),

@@ -18,6 +18,7 @@ NEWTON_STEPS_SOFT = 16  # where a tension is not small beside the rod's own stif
 SOFT = 0.1  # this much of it
 STRAIGHT = 1e-3  # rad over the longest tendon: the turning below which a path is as good as straight
 LEAK = 0.02  # of an unknown tension below slack: the slope that a filter still feels
+SLACK = 0.1  # of its standard deviation: within this of zero its going slack is eased, so that the filter can settle there
 SETTLED = 1e-7  # relative change of the strains that further steps may still make
 Strains = Float[Tensor, "... 6"]
 
@@ -106,21 +107,39 @@ class Tendon:
         return torch.cat([r, zero], -1), torch.cat([dr, zero], -1), torch.cat([6 * c3 * t + 2 * c2, zero], -1)
 
 
+def eased(tau: Float[Tensor, "... T"], w: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+    """Tensions (N) without a kink where a tendon goes slack: for tau within +-w of 0, and below,
+
+        max(tau, 0)  ->  (1 - e) (tau + w)^2 / (4 w) + e tau,    (1 - e) 0 + e tau
+
+    e: LEAK, by which a filter that is to lower the tension still feels that it cannot: without it, it would step from below -w to
+    the prior's mean and back. w = 0: max(tau, 0).
+    """
+    soft = (1 - LEAK) * (tau + w).clamp(min=0.0).square() / torch.where(w > 0, 4 * w, 1.0) + LEAK * tau
+    return torch.where(w > 0, torch.where(tau < w, soft, tau), tau.clamp(min=0.0))
+
+
+def eased_slope(tau: Float[Tensor, "... T"], w: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
+    """How `eased` moves with tau."""
+    soft = (1 - LEAK) * (tau + w).clamp(min=0.0) / torch.where(w > 0, 2 * w, 1.0) + LEAK
+    return torch.where(w > 0, torch.where(tau < w, soft, 1.0), (tau > 0).to(tau.dtype))
+
+
 @dataclass(frozen=True)
 class TendonTable:
     """Every tendon at given arc lengths, for strains x = [v, u] (..., 6).
 
     along_j = L_j x + r'_j with L_j = [I, -hat(r_j)]: L (..., T, 3, 6), dr (..., T, 3); tau (..., T) N, zero past a tendon's end.
-    newton: how many steps the strain balance takes. friction: of every tendon, (T,), with the sign of its motion, and then ddr,
-    r''_j (..., T, 3), and floor (1/m) as well; tau is then the tension at the base, where it is known. chord: c_0 .. c_3 of
-    `chords`, (..., T, 4), where tendons run straight between discs, and then ddr as well.
+    newton: how many steps the strain balance takes. friction: of every tendon, (T,) or (..., T), with the sign of its motion, and
+    then ddr, r''_j (..., T, 3), and floor (1/m) as well; tau is then the tension at the base, where it is known. chord: c_0 .. c_3
+    of `chords`, (..., T, 4), where tendons run straight between discs, and then ddr as well.
     """
 
     L: Float[Tensor, "... T 3 6"]
     dr: Float[Tensor, "... T 3"]
     tau: Float[Tensor, "... T"]
     newton: int = NEWTON_STEPS
-    friction: Float[Tensor, " T"] | None = None
+    friction: Float[Tensor, "... T"] | None = None
     ddr: Float[Tensor, "... T 3"] | None = None
     floor: float = 0.0
     chord: Float[Tensor, "... T 4"] | None = None
@@ -133,10 +152,15 @@ class TendonTable:
 
 @dataclass(frozen=True)
 class Tendons:
-    """The robot's tendons; an empty tuple is a passive rod. clamped: whether tensions below zero are none; not of `eased`."""
+    """The robot's tendons; an empty tuple is a passive rod.
+
+    clamped: whether tensions below zero are none; not of `eased`. followed: whether Theta is known of every tendon even where none
+    rubs.
+    """
 
     tendons: tuple[Tendon, ...] = field(default=())
     clamped: bool = True
+    followed: bool = False
 
     def __len__(self) -> int:
         return len(self.tendons)
@@ -153,34 +177,27 @@ class Tendons:
 
     @property
     def friction(self) -> Float[Tensor, " T"] | None:
-        """Of every tendon, with the sign of its motion; None where there is none."""
+        """Of every tendon, with the sign of its motion; None where there is none and Theta is not followed."""
         mu = [t.friction * t.motion for t in self.tendons]
-        return torch.tensor(mu, dtype=DTYPE) if any(mu) else None
+        return torch.tensor(mu, dtype=DTYPE) if any(mu) or self.followed else None
 
     def true_tension(self, reading: Float[Tensor, "... T"]) -> Float[Tensor, "... T"]:
         """tau = max(gain reading + offset, 0) (N): a load cell has a zero offset, and a tendon can only pull (where `clamped`)."""
-        gain, offset = self._cells
+        gain, offset = self.cells
         tau = gain * reading + offset
         return tau.clamp(min=0.0) if self.clamped else tau
 
     @property
-    def _cells(self) -> tuple[Float[Tensor, " T"], Float[Tensor, " T"]]:
+    def cells(self) -> tuple[Float[Tensor, " T"], Float[Tensor, " T"]]:
         """Gain and offset (N) of every tendon's load cell."""
         gain, offset = (torch.tensor([getattr(t, f"tension_{k}") for t in self.tendons], dtype=DTYPE) for k in ("gain", "offset"))
         return gain, offset
 
     def eased(self, reading: Float[Tensor, "... T"], width: Float[Tensor, " T"]) -> Float[Tensor, "... T"]:
-        """Readings (N) whose true tensions have no kink where a tendon goes slack: for tau within +-w of 0, and below,
-
-        max(tau, 0)  ->  (1 - e) (tau + w)^2 / (4 w) + e tau,    (1 - e) 0 + e tau
-
-        w: width (N) of a reading, as the load cell's gain makes a tension of it. e: LEAK, by which a filter that is to lower the
-        tension still feels that it cannot: without it, it would step from below -w to the prior's mean and back.
-        """
-        gain, offset = self._cells
+        """Readings (N) whose true tensions are `eased`. width (N): of a reading."""
+        gain, offset = self.cells
         tau, w = gain * reading + offset, gain * width
-        eased = torch.where(tau < w, (1 - LEAK) * (tau + w).clamp(min=0.0).square() / (4 * w) + LEAK * tau, tau)
-        return torch.where(tau < w, (eased - offset) / gain, reading)
+        return torch.where(tau < w, (eased(tau, w) - offset) / gain, reading)
 
     def newton_steps(self, K_se: Matrix, K_bt: Matrix, tension: Float[Tensor, "... T"]) -> int:
         """More where sum tau / K_se or sum tau r^2 / K_bt says that the tendons are as stiff as the rod."""

@@ -14,23 +14,23 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ..mechanics.grid import DEFAULT_STEPS, Places, on_rod
-from ..mechanics.integrate import march_linearized, with_theta
+from ..mechanics.grid import DEFAULT_STEPS, Grid, Places, on_rod
+from ..mechanics.integrate import march, march_linearized, states_at, with_theta
 from ..mechanics.jacobian import forward_jacobian, moved_along
 from ..mechanics.lie import Matrix, Vector, conjugate, exponential, move, product, unrotate
-from ..mechanics.loads import LoadIntegrals, total
+from ..mechanics.loads import Load, LoadIntegrals, total
 from ..mechanics.robot import Robot
-from ..mechanics.section import Section, derivative
+from ..mechanics.section import Section, StageTable, derivative
 from ..mechanics.statics import Shape, base_state, beyond_tip, grid_for, shape_from_base, shape_of, stage_table, steps_of_rod
+from ..mechanics.tendons import SLACK
 from ..util.by_value import Kept, key
 from ..util.precision import DTYPE, Float64
+from .deviations import Deviations
 from .sensors import Markers, RodState, Sensor, TipWrench
-from .uncertainty import Warp, near_zero
 from .unknowns import State, Unknowns
 
 COARSE_STEPS = 20  # along the rod, as long as a fit is far from the data: within 1e-6 m of the exact shape
 TIP_ROWS = 6
-SLACK = 0.1  # of a tension's standard deviation: within this of zero its going slack is eased, so that the filter can settle there
 FINEST = 5e-7  # of the length: the least noise of a marker. What steps and round-off leave must not decide a verdict
 TIP_FORCE_STD = 1e-3  # in force scales: 1 mN on the paper's rod
 TIP_MOMENT_STD = 5e-4  # in moment scales: 0.1 mN m on the paper's rod
@@ -48,7 +48,7 @@ _OF_READINGS = (
     "groups",
     "group_count",
     "usable",
-    "wide",
+    "deviations",
 )
 
 
@@ -64,8 +64,7 @@ class Problem(Float64):
     steps: the least number of arc-length steps; 0: as many as the reference shape asks for. prior: mean and precision of x instead
     of the unknowns' own, (n) or (B, n), in the units of `state`. tip_std: standard deviations (N, N m) of a component of the tip
     residual, W^-1/2 of the paper's W on c, which then stay to the end; None: c is zero at the answer, and TIP_FORCE_STD and
-    TIP_MOMENT_STD in the rod's scales ease the way there. warp: how positions are measured wrongly, where that is known. Errors:
-    ValueError of `check`.
+    TIP_MOMENT_STD in the rod's scales ease the way there. Errors: ValueError of `check`.
     """
 
     robot: Robot
@@ -75,7 +74,6 @@ class Problem(Float64):
     steps: int = 0
     prior: tuple[Tensor, Tensor] | None = None
     tip_std: tuple[float, float] | None = None
-    warp: Warp | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -235,9 +233,9 @@ class Problem(Float64):
         if prior is not None:
             prior = prior[0][index] if prior[0].ndim > 1 else prior[0], prior[1][index] if prior[1].ndim > 1 else prior[1]
         part = replace(self, sensors=[sensor.take(index) for sensor in self.sensors], tension=tension, prior=prior)
-        vars(part)["state"] = self.state  # which for a robot of `off` has the units of the exact one
-        if "wide" in vars(self):
-            vars(part)["wide"] = self.wide
+        vars(part)["state"] = self.state
+        if "deviations" in vars(self):
+            vars(part)["deviations"] = self.deviations
         return part
 
     def without(self, groups: Bool[Tensor, "B G"]) -> "Problem":
@@ -307,64 +305,49 @@ class Problem(Float64):
         robot = self.robot
         return robot if not self.state.tension.size else replace(robot, tendons=replace(robot.tendons, clamped=False))
 
+    @cached_property
+    def deviations(self) -> Deviations | None:
+        """How the robot's tables move with the parameters' errors; None where it is known."""
+        nearly = self.unknowns.uncertainty
+        return Deviations(nearly, self.robot) if nearly is not None and self.state.parameters.size else None
+
+    @property
+    def on_grid(self) -> Robot:
+        """The robot on whose grid the walk is, with all that may vary along it."""
+        return self.robot if self.deviations is None else self.deviations.prepared
+
+    def own_weight(self, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 3"]:
+        """Of the whole robot (N, base frame)."""
+        if self.deviations is None:
+            return self.robot.rod.mass * self.robot.gravity
+        return self.deviations.own_weight(x[..., self.state.parameters.at])
+
     def shape(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Shape:
-        """The rod at the sensors' arc lengths, in its own base frame; what is only nearly known of it as its file has it."""
-        state = self.state
-        if state.parameters.size:
-            return self.exact.shape(self.without_parameters(x)[0], differentiable)
-        loads = self.unknowns.loads.loads(x[..., state.loads.at])
-        return shape_from_base(self.as_pulled, loads, state.base.of(x), self.pulling(x), self.s, self.steps, differentiable)
+        """The rod at the sensors' arc lengths, in its own base frame."""
+        state, nearly = self.state, self.deviations
+        loads, alpha = self.unknowns.loads.loads(x[..., state.loads.at]), state.base.of(x)
+        if nearly is None:
+            return shape_from_base(self.as_pulled, loads, alpha, self.pulling(x), self.s, self.steps, differentiable)
+        robot = nearly.prepared
+        grid = grid_for(robot, loads, self.s, self.steps)
+        table = self._table(x, loads, grid)
+        assert table.section is not None
+        y = with_theta(base_state(robot, alpha, table), table)
+        states = states_at(march(table.section, y, table, grid), grid.outputs_and_tip)
+        return shape_of(table.section, states, beyond_tip(robot, loads, alpha))
+
+    def _table(self, x: Float[Tensor, "... n"], loads: tuple[Load, ...], places: Grid | Places) -> StageTable:
+        """All that is known along the rod that x says."""
+        nearly = self.deviations
+        if nearly is None:
+            return stage_table(self.as_pulled, loads, self.pulling(x), places)
+        kappa = nearly.amounts(x[..., self.state.parameters.at], self.tension)
+        table = nearly.moved(nearly.prepared, self.tension, kappa, places)
+        return replace(table, loads=table.loads + total(loads, places.stages, places.inside))
 
     def h(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Float[Tensor, "... z"]:
         """[rows of every sensor, c (N, N m)]: what the sensors would read, in their units, then the tip residual."""
-        if not self.state.parameters.size:
-            return self._read(self.shape(x, differentiable), x)
-        plain, theta = self.without_parameters(x)
-        h = self.exact.h(plain, differentiable)
-        return near_zero(h, (other.h(plain, differentiable) for other in self.off), theta, self.wide)[0]
-
-    # The robot's parameters: model.uncertainty.
-
-    @cached_property
-    def exact(self) -> "Problem":
-        """The same with a robot that is known."""
-        assert self.unknowns.uncertainty is not None
-        unknowns = replace(self.unknowns, uncertainty=None)
-        return replace(self, robot=self.unknowns.uncertainty.prepared(self.robot), unknowns=unknowns, prior=None)
-
-    @cached_property
-    def off(self) -> list["Problem"]:
-        """With every parameter off, in turn, as Uncertainty.nearby has it; x in the units of the exact one."""
-        exact, found = self.exact, []
-        assert self.unknowns.uncertainty is not None
-        for robot, warp in self.unknowns.uncertainty.nearby(exact.robot):
-            other = replace(exact, robot=robot, warp=warp)
-            vars(other)["state"] = exact.state
-            found.append(other)
-        return found
-
-    @cached_property
-    def wide(self) -> tuple[float, ...]:
-        """Which parameters have a quartic, and how far it reaches (model.uncertainty)."""
-        assert self.unknowns.uncertainty is not None
-        return self.unknowns.uncertainty.wide(self.robot)
-
-    def without_parameters(self, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... m"], Float[Tensor, "... k"]]:
-        """x without the parameters, and these, in standard deviations."""
-        at = self.state.parameters.at
-        return torch.cat([x[..., : at.start], x[..., at.stop :]], -1), x[..., at]
-
-    def with_parameters(
-        self,
-        at_zero: tuple[Float[Tensor, "B z"], Float[Tensor, "B z m"]],
-        off: list[tuple[Float[Tensor, "B z"], Float[Tensor, "B z m"]]],
-        theta: Float[Tensor, "B k"],
-    ) -> tuple[Float[Tensor, "B z"], Float[Tensor, "B z n"]]:
-        """h and H from those of `exact` and of every `off` at x without the parameters."""
-        (h, H), at = at_zero, self.state.parameters.at.start
-        h, slopes = near_zero(h, (one for one, _ in off), theta, self.wide)
-        H, _ = near_zero(H, (one for _, one in off), theta, self.wide)
-        return h, torch.cat([H[..., :at], torch.stack(slopes, -1), H[..., at:]], -1)
+        return self._read(self.shape(x, differentiable), x)
 
     def read(self, states: Float[Tensor, "B P1 w"], x: Float[Tensor, "B n"]) -> Float[Tensor, "B rows"]:
         """What the sensors read of a section's states [p (m), q, wrench (N, N m)] at their arc lengths and at the tip, in its own
@@ -388,8 +371,8 @@ class Problem(Float64):
         if state.registration.size:
             zeta = state.registration.of(x)
             p, q = move(zeta, p), product(exponential(zeta[..., 3:]).unsqueeze(-2), q)
-        if self.warp is not None:
-            p = self.warp(p)
+        if self.deviations is not None and self.deviations.seen:
+            p = self.deviations.warp(x[..., state.parameters.at])(p)
         rows, first, alpha, tip = [], 0, state.base.of(x), state.tip_wrench(x)
         for sensor in self.sensors:
             at = slice(first, first + len(sensor.s))
@@ -401,7 +384,7 @@ class Problem(Float64):
     def _strains(self, y: Float[Tensor, "... P w"], x: Float[Tensor, "... n"], at: slice) -> tuple[Vector, Vector]:
         """v (-) and u (1/m) at the arc lengths `at` of all sensors', from the rates of mechanics.section at the states y."""
         loads, robot = self.unknowns.loads.loads(x[..., self.state.loads.at]), self.robot
-        table = stage_table(self.as_pulled, loads, self.pulling(x), Places(self.s[at])).stage(0)
+        table = self._table(x, loads, Places(self.s[at])).stage(0)
         q = y[..., 3:7]
         rate = derivative(Section.of(robot.rod.K_se, robot.rod.K_bt), y, table)
         return unrotate(q, rate[..., :3]), 2 * product(conjugate(q), rate[..., 3:7])[..., :3]
@@ -411,15 +394,12 @@ class Problem(Float64):
 
         The rod's share of the tangents goes through `march_linearized`, which has a compiled path; what comes before it (load
         integrals of gamma) and after it (sensors, registration, tip residual) by torch.func. The same as forward_jacobian(h), which
-        is what is used where the nodes move with x (point loads at unknown places) or tensions are unknown.
+        is what is used where the nodes move with x (point loads at unknown places), or where tensions or the robot are not known.
         """
         state, family = self.state, self.unknowns.loads
-        if state.parameters.size:
-            plain, theta = self.without_parameters(x)
-            return self.with_parameters(self.exact.linearized(plain), [other.linearized(plain) for other in self.off], theta)
         gamma, alpha = x[..., state.loads.at], state.base.of(x)
         grid = grid_for(self.robot, family.loads(gamma), self.s, self.steps)
-        if grid.nodes.ndim > 1 or state.tension.size:
+        if grid.nodes.ndim > 1 or state.tension.size or state.parameters.size:
             return forward_jacobian(self.h, x)
         g, B, S = state.loads.size, len(x), grid.h.shape[-1]
         like = x.new_zeros(())

@@ -1,28 +1,20 @@
 """What is only nearly known of a robot: its parameters with standard deviations, unknowns of every sample with these as priors.
 
 A robot is never quite as its file says. Where a fit takes it as exact, what its error does to the shape passes for a load; with the
-error unknown, within what is known of it, intervals hold (docs/trust.md). The model is a parabola in each error,
-
-    (1)  h(x, theta) = h(x, 0) + sum_k theta_k (h_k+ - h_k-) / 2 + theta_k^2 (h_k+ + h_k- - 2 h(x, 0)) / 2,    theta_k ~ N(0, 1)
-
-through h(x, 0) and h_k+-, of a robot whose parameter k is off by one standard deviation upwards and downwards; the errors of two
-parameters act side by side. dh/dx follows by the same parabola. Of a stiffness that may be off by more than WIDE the slope of a
-parabola is off by WIDE^2, which markers take for knowledge of it: it has a quartic, through FAR deviations (or NEAR) as well, and
-two of them have mixed terms up to theta_i^2 theta_j^2, through robots that are off by both. Where a calibration has found errors
-that are correlated, theta_k moves all of them along a column of a root of their covariance, by a parabola.
+error unknown, within what is known of it, intervals hold (docs/trust.md). The errors are L theta, theta ~ N(0, 1), L a root of
+their covariance: diagonal, but where a calibration has found errors that are correlated. The model is that of the robot which is
+off by them (model.deviations).
 """
 
-import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..mechanics.lie import hat
+from ..mechanics.lie import Vector, exponential, hat, rotate
 from ..mechanics.robot import Robot
 from ..mechanics.rod import Rod
 from ..mechanics.tendons import Tendon, Tendons
@@ -31,13 +23,12 @@ from ..util.precision import DTYPE, Float64
 MOST_SHARE = 0.5  # of a number whose error is relative: with more, one standard deviation leaves next to nothing of it
 KNOTS = 10  # pieces of the length over which an error of the curvature is one, where no length is stated
 RELATIVE = ("stiffness", "mass", "tension")  # errors that are shares of a number
+OVAL, GRAVITY = ("oval_1", "oval_2"), ("gravity_1", "gravity_2")
+LEAST = 0.3  # a share of a stiffness, below which it falls ever more slowly
+TURN_SERIES = 1e-4  # rad^2: below it sin and cos by their series
 OF_TENDONS = ("tension", "tension_offset", "friction", "tendon_place")
 SHIFT, TURN = (tuple(f"frame_{kind}{axis}" for axis in "xyz") for kind in ("", "turn_"))  # entries of a Warp
 STRAIN = tuple(f"metric_{axes}" for axes in ("xx", "yy", "zz", "yz", "xz", "xy"))
-MOST_MIXED = 4  # stiffnesses, of which all pairs have a mixed term
-WIDE, OF_STIFFNESS = 0.04, ("stiffness", "oval")  # a share, and whose
-FAR, NEAR = 2.0, 0.5  # deviations: where a quartic goes through beside one, if that leaves half of the stiffness or not
-CORNER = 1.5  # deviations, of both of a pair that goes FAR
 NONE = 1e-12  # of a standard deviation: what is left of a direction that is none
 Change = Callable[[Robot, float], Robot]
 
@@ -67,34 +58,59 @@ class Warp(Float64):
     """How positions are measured: exp(turn) (I + E) p + shift, of p where they are, base frame.
 
     shift (3,) m and turn (3,) rad: of the base frame. strain (6,): xx, yy, zz, yz, xz, xy of the symmetric E, by which the metric
-    of cameras is off.
+    of cameras is off. Of all samples, or each of its own.
     """
 
-    shift: Float[Tensor, " 3"]
-    turn: Float[Tensor, " 3"]
-    strain: Float[Tensor, " 6"]
+    shift: Float[Tensor, "*B 3"]
+    turn: Float[Tensor, "*B 3"]
+    strain: Float[Tensor, "*B 6"]
 
     @classmethod
-    def of(cls, entries: dict[str, float]) -> "Warp":
+    def of(cls, entries: Mapping[str, float]) -> "Warp":
         """From errors by their names; those that are none of its own are left aside."""
         shift, turn, strain = ([entries.get(name, 0.0) for name in names] for names in (SHIFT, TURN, STRAIN))
         return cls(*(torch.tensor(values, dtype=DTYPE) for values in (shift, turn, strain)))
 
-    @cached_property
-    def matrix(self) -> Float[Tensor, "3 3"]:
-        """What multiplies p."""
-        xx, yy, zz, yz, xz, xy = self.strain
-        E = torch.stack([torch.stack(row) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))])
-        R = torch.linalg.matrix_exp(hat(self.turn))
-        return R @ (torch.eye(3, dtype=DTYPE) + E)
+    @property
+    def _stretch(self) -> Float[Tensor, "*B 3 3"]:
+        xx, yy, zz, yz, xz, xy = self.strain.unbind(-1)
+        E = torch.stack([torch.stack(row, -1) for row in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))], -2)
+        return torch.eye(3, dtype=DTYPE) + E
 
-    def __call__(self, p: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+    @property
+    def matrix(self) -> Float[Tensor, "*B 3 3"]:
+        """R (I + E), which multiplies p."""
+        return rotate(exponential(self.turn).unsqueeze(-2), self._stretch.mT).mT
+
+    def __call__(self, p: Float[Tensor, "... P 3"]) -> Float[Tensor, "... P 3"]:
         """Measured, of where they are."""
-        return p @ self.matrix.mT + self.shift
+        return rotate(exponential(self.turn).unsqueeze(-2), p @ self._stretch.mT) + self.shift.unsqueeze(-2)
 
-    def undone(self, p: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3"]:
+    def slopes(self, p: Float[Tensor, "... P 3"]) -> Float[Tensor, "... P 3 12"]:
+        """How what is measured of p moves with shift, turn and strain: I, -hat(R (I + E) p) J, R E_k p; J: R's left Jacobian."""
+        q = exponential(self.turn).unsqueeze(-2)
+        stretched = rotate(q, p @ self._stretch.mT)
+        w = hat(self.turn)
+        angle = (self.turn * self.turn).sum(-1)[..., None, None]
+        small = angle < TURN_SERIES
+        phi = torch.where(small, 1.0, angle).sqrt()
+        a = torch.where(small, 0.5 - angle / 24, (1 - phi.cos()) / phi**2)
+        b = torch.where(small, 1 / 6 - angle / 120, (phi - phi.sin()) / phi**3)
+        J = torch.eye(3, dtype=DTYPE) + a * w + b * (w @ w)
+        x, y, z = (torch.nn.functional.one_hot(torch.tensor(k), 3).to(DTYPE) * p[..., k : k + 1] for k in range(3))
+
+        def swapped(i: int, j: int) -> Tensor:
+            unit = torch.eye(3, dtype=DTYPE)
+            return p[..., j : j + 1] * unit[i] + p[..., i : i + 1] * unit[j]
+
+        strained = [rotate(q, v) for v in (x, y, z, swapped(1, 2), swapped(0, 2), swapped(0, 1))]
+        shift = torch.eye(3, dtype=DTYPE).expand(*p.shape, 3)
+        return torch.cat([shift, -hat(stretched) @ J.unsqueeze(-3), torch.stack(strained, -1)], -1)
+
+    def undone(self, p: Float[Tensor, "... P 3"]) -> Float[Tensor, "... P 3"]:
         """Where they are, of what was measured."""
-        return torch.linalg.solve(self.matrix, (p - self.shift).unsqueeze(-1)).squeeze(-1)
+        back = rotate(exponential(-self.turn).unsqueeze(-2), p - self.shift.unsqueeze(-2))
+        return torch.linalg.solve(self._stretch, back.mT).mT
 
 
 @dataclass(frozen=True)
@@ -189,44 +205,17 @@ class Uncertainty:
         C[at.unsqueeze(-1), at] += self.found.covariance - torch.diag(self.found.covariance.diagonal())
         return std.unsqueeze(-1) * torch.linalg.cholesky(_correlation(C) + NONE * torch.eye(len(C), dtype=DTYPE))
 
-    def wide(self, robot: Robot) -> tuple[float, ...]:
-        """How many deviations off the quartic of every unknown xi goes through, 0 where a parabola does: FAR of a section that is
-        oval, of which any direction of the two errors is as likely. Errors that a calibration has mixed keep their parabola, along
-        which a shape that nothing explains runs far.
-        """
-        if self.found is not None:
-            return (0.0,) * len(self.parameters(robot))
-        found = []
-        for p in self.parameters(robot):
-            kind = p.name.split("_")[0]
-            far = FAR if kind == "oval" and FAR * p.std <= MOST_SHARE * robot.rod.softer_side else NEAR
-            found.append(far if kind in OF_STIFFNESS and p.std > WIDE else 0.0)
-        return tuple(found)
-
-    def nearby(self, robot: Robot) -> list[tuple[Robot, Warp | None]]:
-        """Robots off by one of every unknown xi, upwards and downwards, in turn, and farther where that is wide; then by both of
-        every `mixed` pair; and how they are measured.
-        """
-        columns, wide = self.root(robot).mT, self.wide(robot)
-        shares = [(k, share) for k, far in enumerate(wide) for share in ((1.0, -1.0, far, -far) if far else (1.0, -1.0))]
-        every = [share * columns[k] for k, share in shares]
-        every += [a * columns[i] + b * columns[j] for i, j in mixed(wide) for a, b in _corners(wide, i, j)]
-        return [self._off_by(robot, errors.tolist()) for errors in every]
-
-    def _off_by(self, robot: Robot, errors: list[float]) -> tuple[Robot, Warp | None]:
-        """The robot with errors of all its parameters, and how it is measured."""
-        listed = self.parameters(robot)
-        seen = {p.name: error for p, error in zip(listed, errors, strict=True) if p.seen and error}
-        for parameter, error in zip(listed, errors, strict=True):
-            robot = parameter.change(robot, error) if error and parameter.change is not None else robot
-        return robot, Warp.of(seen) if seen else None
-
     def found_at(self, robot: Robot, errors: Mapping[str, float]) -> tuple[Robot, Warp]:
         """The robot with errors by their names, as a fit has found them, and how it is measured; names of others are left aside."""
+        sides, turn = (torch.tensor([errors.get(name, 0.0) for name in names], dtype=DTYPE) for names in (OVAL, GRAVITY))
+        most, off = robot.rod.softer_side, robot
         for parameter in self.parameters(robot):
             error = errors.get(parameter.name, 0.0)
-            robot = parameter.change(robot, error) if error and parameter.change is not None else robot
-        return robot, Warp.of(dict(errors))
+            if error and parameter.change is not None and parameter.name not in (*OVAL, *GRAVITY):
+                off = parameter.change(off, error)
+        if bool(sides.any()):  # those of a pair act at once
+            off = _ovals(off, *within(sides, most)[0].tolist())
+        return replace(off, gravity=turned_gravity(off.gravity, turn)[0]) if bool(turn.any()) else off, Warp.of(errors)
 
     def _of(self, robot: Robot, std: dict[str, float]) -> list[Parameter]:
         """All that a robot has, with these standard deviations of their kinds."""
@@ -270,22 +259,62 @@ def _correlation(C: Float[Tensor, "k k"]) -> Float[Tensor, "k k"]:
     return C / d / d.unsqueeze(-1)
 
 
+def positive(share: Float[Tensor, "..."]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
+    """A share x of a stiffness, which stays positive: l^2 / (2 l - x) below l = LEAST, where it goes on smoothly; its slope."""
+    room = (2 * LEAST - share).clamp(min=LEAST)
+    low = share < LEAST
+    return torch.where(low, LEAST**2 / room, share), torch.where(low, LEAST**2 / room**2, 1.0)
+
+
+def within(sides: Float[Tensor, "... 2"], most: float) -> tuple[Float[Tensor, "... 2"], Float[Tensor, "... 2 2"]]:
+    """Two errors x of a section that is oval, whose size stays below `most`; their slopes.
+
+    What is left of the softer side, the share 1 - b with b = |x| / most, is `positive`.
+    """
+    size = (sides * sides).sum(-1, keepdim=True) / most**2
+    far = size > (1 - LEAST) ** 2
+    b = torch.where(far, size, 1.0).sqrt()
+    left, slope = positive(1 - b)
+    f, df = torch.where(far, (1 - left) / b, 1.0), torch.where(far, (slope - (1 - left) / b) / b**2, 0.0)
+    bent = (df / most**2).unsqueeze(-1) * sides.unsqueeze(-1) * sides.unsqueeze(-2)
+    return sides * f, f.unsqueeze(-1) * torch.eye(2, dtype=sides.dtype) + bent
+
+
+def turned_gravity(g: Vector, turn: Float[Tensor, "... 2"]) -> tuple[Vector, Float[Tensor, "... 3 2"]]:
+    """Gravity turned by |turn| (rad), towards two axes a that are normal to it and to each other; its slopes.
+
+    g' = cos |e| g + |g| sin |e| / |e| (e_1 a_1 + e_2 a_2)
+    """
+    # Of sizes to a half of the largest, so that directions that are nearly alike have the same axes.
+    coarse = (2 * g.abs() / g.abs().amax(-1, keepdim=True)).round()
+    least = torch.nn.functional.one_hot(coarse.argmin(-1), 3).to(g.dtype)
+    size, first = g.norm(dim=-1, keepdim=True), torch.linalg.cross(g, least)
+    first = first * (size / first.norm(dim=-1, keepdim=True))
+    axes = torch.stack([first, torch.linalg.cross(g, first) / size], -1)
+    angle = (turn * turn).sum(-1, keepdim=True)
+    small = angle < TURN_SERIES
+    phi = torch.where(small, 1.0, angle).sqrt()
+    cos = torch.where(small, 1 - angle / 2 + angle * angle / 24, phi.cos())
+    sinc = torch.where(small, 1 - angle / 6 + angle * angle / 120, phi.sin() / phi)
+    dsinc = torch.where(small, angle / 30 - 1 / 3, (phi.cos() - phi.sin() / phi) / phi**2)  # per turn
+    towards = (axes * turn.unsqueeze(-2)).sum(-1)
+    slopes = sinc.unsqueeze(-1) * axes + (dsinc * towards - sinc * g).unsqueeze(-1) * turn.unsqueeze(-2)
+    return cos * g + sinc * towards, slopes
+
+
 def _stiffness(robot: Robot, error: float) -> Robot:
-    rod = robot.rod
-    return replace(robot, rod=replace(rod, K_se=(1 + error) * rod.K_se, K_bt=(1 + error) * rod.K_bt))
+    rod, share = robot.rod, float(positive(torch.tensor(1 + error, dtype=DTYPE))[0])
+    return replace(robot, rod=replace(rod, K_se=share * rod.K_se, K_bt=share * rod.K_bt))
 
 
 def _oval(k: int) -> Change:
-    """Stiffer in bending about one axis of the section than about the one across: about x than y (k = 0), or halfway between."""
-    shape = torch.tensor(
-        [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.0]] if k == 0 else [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0] * 3]
-    )
+    return lambda robot, error: _ovals(robot, *((error, 0.0) if k == 0 else (0.0, error)))
 
-    def change(robot: Robot, error: float) -> Robot:
-        rod = robot.rod
-        return replace(robot, rod=replace(rod, K_bt=rod.K_bt + error * rod.bending_stiffness * shape.to(DTYPE)))
 
-    return change
+def _ovals(robot: Robot, first: float, second: float) -> Robot:
+    """Stiffer in bending about one axis of the section than about the one across: about x than y, and halfway between."""
+    rod, sides = robot.rod, torch.tensor([[first, second, 0.0], [second, -first, 0.0], [0.0, 0.0, 0.0]], dtype=DTYPE)
+    return replace(robot, rod=replace(rod, K_bt=rod.K_bt + rod.bending_stiffness * sides))
 
 
 def _mass(robot: Robot, error: float) -> Robot:
@@ -322,17 +351,9 @@ def _tendon_place(j: int, axis: int) -> Change:
 
 
 def _gravity(k: int) -> Change:
-    """Turned about one of two axes normal to it."""
-
     def change(robot: Robot, error: float) -> Robot:
-        g = robot.gravity
-        # Of sizes to a half of the largest, so that a small turn does not choose another axis.
-        coarse = (2 * g.abs() / g.abs().amax(-1, keepdim=True)).round()
-        least = torch.nn.functional.one_hot(coarse.argmin(-1), 3).to(g.dtype)
-        first = torch.linalg.cross(g, least)
-        first = first * (g.norm(dim=-1, keepdim=True) / first.norm(dim=-1, keepdim=True))
-        across = first if k == 0 else torch.linalg.cross(g, first) / g.norm(dim=-1, keepdim=True)
-        return replace(robot, gravity=math.cos(error) * g + math.sin(error) * across)
+        turn = torch.tensor([error, 0.0] if k == 0 else [0.0, error], dtype=DTYPE)
+        return replace(robot, gravity=turned_gravity(robot.gravity, turn)[0])
 
     return change
 
@@ -368,49 +389,3 @@ def _with_rows(rod: Rod, places: list[float]) -> Float[Tensor, "rows 4"]:
     new = every[(rows[:, 0].unsqueeze(-1) - every).abs().amin(0) > 1e-9 * rod.length]
     rows = torch.cat([rows, torch.cat([new.unsqueeze(-1), rod.curvature_at(new, new)], -1)])
     return rows[rows[:, 0].argsort(stable=True)]
-
-
-def near_zero(
-    at_zero: Float[Tensor, "B z *m"], off: Iterable[Float[Tensor, "B z *m"]], theta: Float[Tensor, "B k"], wide: Sequence[float]
-) -> tuple[Float[Tensor, "B z *m"], list[Float[Tensor, "B z *m"]]]:
-    """(1), and its derivatives by each theta, from the values at zero and at what `nearby` has of each, in turn."""
-    others, value, slopes, parts = iter(off), at_zero.clone(), [], []
-    each = [t.reshape(-1, *[1] * (at_zero.ndim - 1)) for t in theta.unbind(-1)]
-    for t, far in zip(each, wide, strict=True):
-        up, down = next(others), next(others)
-        odd, even = 0.5 * (up - down), 0.5 * (up + down) - at_zero
-        cubic, quartic, slope = 0.0, 0.0, odd
-        if far:
-            up, down = next(others), next(others)
-            cubic = (0.5 * (up - down) / far - odd) / (far**2 - 1)
-            quartic = ((0.5 * (up + down) - at_zero) / far**2 - even) / (far**2 - 1)
-            odd, even = odd - cubic, even - quartic
-            value.addcmul_(t**3, cubic).addcmul_(t**4, quartic)
-            slope = odd + 3 * t**2 * cubic + 4 * t**3 * quartic
-        value.addcmul_(t, odd).addcmul_(t**2, even)
-        slopes.append(slope + 2 * t * even)
-        parts.append((odd, even, cubic, quartic))
-    for i, j in mixed(wide):
-        a, b, c = each[i], each[j], _corners(wide, i, j)[0][0]
-        pp, pm, mp, mm = (next(others) for _ in range(4))
-        (odd_i, even_i), (odd_j, even_j) = (
-            (odd * c + cubic * c**3, even * c**2 + quartic * c**4) for odd, even, cubic, quartic in (parts[i], parts[j])
-        )
-        ab, aab = 0.25 * (pp - pm - mp + mm) / c**2, (0.25 * (pp - pm + mp - mm) - odd_j) / c**3
-        abb, aabb = (0.25 * (pp + pm - mp - mm) - odd_i) / c**3, (0.25 * (pp + pm + mp + mm) - at_zero - even_i - even_j) / c**4
-        value.addcmul_(a * b, ab + a * aab + b * abb + (a * b) * aabb)
-        slopes[i].addcmul_(b, ab + 2 * a * aab + b * abb + 2 * (a * b) * aabb)
-        slopes[j].addcmul_(a, ab + a * aab + 2 * b * abb + 2 * (a * b) * aabb)
-    return value, slopes
-
-
-def _corners(wide: Sequence[float], i: int, j: int) -> list[tuple[float, float]]:
-    """By how many deviations both of a pair are off at its four robots: it has all terms up to theta_i^2 theta_j^2."""
-    c = CORNER if min(wide[i], wide[j]) == FAR else 1.0
-    return [(c, c), (c, -c), (-c, c), (-c, -c)]
-
-
-def mixed(wide: Sequence[float]) -> list[tuple[int, int]]:
-    """Pairs of wide ones; none where there are more than MOST_MIXED of these."""
-    at = [k for k, far in enumerate(wide) if far]
-    return list(itertools.combinations(at, 2)) if len(at) <= MOST_MIXED else []
