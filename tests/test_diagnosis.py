@@ -300,6 +300,34 @@ def test_what_is_off_of_the_robot_is_named(what, said):
     assert any(said[0] in found.message(b) for b in refused)
 
 
+@pytest.mark.parametrize("bent", [True, False])
+def test_a_bend_that_passes_for_contacts_is_named(bent):
+    """One push on a rod that is bent, unloaded, other than its file says, is accepted as two contacts; two pushes are two."""
+    random, B, robot, noise = torch.Generator().manual_seed(0), 16, steel_rod(), 4e-4
+    count, s, shapes = 1 if bent else 2, torch.linspace(0.02, L, 20), []
+    for _ in range(B):
+        rod, a = robot.rod, 6.28 * float(torch.rand(1, generator=random))
+        if bent:
+            rod = replace(rod, reference_curvature=T([[0.0, 0.3 * math.cos(a), 0.3 * math.sin(a), 0.0]]))
+        size, turn = 0.5 + torch.rand(1, count, generator=random), 6.28 * torch.rand(1, count, generator=random)
+        place = 0.12 + 0.08 * torch.rand(1, count, generator=random) + 0.16 * torch.arange(count)
+        load = PointForces(torch.stack([size * turn.cos(), size * turn.sin(), 0 * size], -1), place)
+        shapes.append(solve_shape(replace(robot, rod=rod), (load,), None, s, 1, 80).p)
+    p = torch.cat(shapes)
+    p = p + noise * torch.randn(p.shape, generator=random)
+    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale)), [Markers(s, p, noise)])
+    found = analyze(problem, contact_hypotheses(problem))
+    several = torch.isfinite(found.estimate.location).sum(-1) > 1
+    wrong = (found.estimate.accepted & several).nonzero().squeeze(-1).tolist()
+    assert len(wrong) > 8
+    said = ["explained as well by a rod that is bent, unloaded" in found.diagnosis.message(b) for b in wrong]
+    if bent:
+        assert sum(said) > 0.7 * len(wrong)
+        assert any('with 1 contact instead of 2: state "set = 0.25"' in found.diagnosis.message(b) for b in wrong)
+    else:
+        assert not any("explained as well by a" in found.diagnosis.message(b) for b in wrong)
+
+
 def test_a_suspect_pays_for_what_its_fit_narrows_down(monkeypatch):
     """(1) of analysis.suspects, by hand, of a bent rod; arc lengths pay ln(1 + a^2) for every marker."""
     problem = off_by("set").take(torch.arange(4))

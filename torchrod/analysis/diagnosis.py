@@ -66,7 +66,7 @@ class Diagnosis:
     a large opposite couple, which no contact is; NaN where there is none. tip_instead (B,): where a force at the tip explains the
     shape with fewer contacts than without it. others: per sample what else explains its readings; () where nothing was looked for.
     rivals: per sample a word on a hypothesis that is nearly as probable as the one that was chosen; () without probabilities.
-    robot: per sample what of the robot, or of the arc lengths, would explain the readings if it were off, or nothing.
+    robot: per sample a sentence on what of the robot, or of the arc lengths, would explain the readings if it were off, or nothing.
     """
 
     s: Float[Tensor, " P"]
@@ -116,7 +116,7 @@ class Diagnosis:
                 "try --registration."
             )
         if self.robot and self.robot[sample]:
-            said.append(f"What explains the readings best is {self.robot[sample]}.")
+            said.append(self.robot[sample])
         if bool(torch.isfinite(self.couple[sample])):
             said.append(
                 f"The shape asks for something that is not a contact near s = {1e3 * float(self.couple[sample]):.3g} mm: two large "
@@ -289,16 +289,38 @@ def _explained(
         fit = estimate_each(part, settings)
         couple[refused] = torch.where(fit.accepted, couples(fit, problem.robot.rod), torch.nan)
         by_load[refused] = _score(part, fit.accepted & couple[refused].isnan(), fit.chi2)
-    by_robot, robot = torch.full_like(own, torch.inf), [""] * len(own)
-    asked = refused[wanted[refused]]
-    off = suspected(problem.take(asked), x[asked], settings)
-    by_robot[asked] = off.score
-    best = torch.stack([by_frame, by_load, by_robot, own - SURE]).amin(0)
-    for b, said in zip(asked.tolist(), off.said, strict=True):
-        robot[b] = said if bool(by_robot[b] == best[b]) else ""
+    by_robot, robot = _by_robot(problem, x, own, wanted, settings)
+    best = torch.stack([by_frame, by_load, by_robot, own]).amin(0)
+    robot = [said if off == least else "" for said, off, least in zip(robot, by_robot.tolist(), best.tolist(), strict=True)]
+    best = torch.minimum(torch.minimum(by_frame, by_load), torch.where(torch.isinf(own), by_robot, own - SURE))
     framed = torch.isfinite(best) & (by_frame == best)
     one_more = torch.isfinite(best) & ~framed & (by_load == best)
     return torch.where(framed.unsqueeze(-1), zeta, torch.nan), one_more, couple, robot
+
+
+def _by_robot(
+    problem: Problem, x: Float[Tensor, "b n"], own: Float[Tensor, " b"], wanted: Bool[Tensor, " b"], settings: Settings
+) -> tuple[Float[Tensor, " b"], list[str]]:
+    """The score of what is off of the robot, and what is said of it: with a fit's loads, and with fewer if it is accepted."""
+    score, said = torch.full_like(own, torch.inf), [""] * len(own)
+    count, accepted = getattr(problem.unknowns.loads, "count", 0), torch.isfinite(own)
+    tried = [(count, problem.unknowns, wanted)]
+    tried += [(k, _with_loads(problem.unknowns, k), wanted & accepted) for k in sorted({1, count - 1} - {count})]
+    for loads, unknowns, which in tried:
+        index = which.nonzero().squeeze(-1)
+        if unknowns is None or not len(index) or not (part := problem.of(unknowns).take(index)).determined:
+            continue
+        at = x[index] if unknowns is problem.unknowns else estimate_each(part, settings).x
+        off = suspected(part, at, settings)
+        sure = torch.where(accepted[index] & (loads == count), SURE, 0.0)  # with no load less it must do better by more
+        for b, found, words in zip(index.tolist(), (off.score + sure).tolist(), off.said, strict=True):
+            if found < score[b]:
+                what, _, remedy = words.partition("; ")
+                score[b], said[b] = found, f"What explains the readings best is {what}; {remedy}."
+                if loads < count:
+                    fewer = f"{loads} contact{'s' * (loads > 1)} instead of {count}"
+                    said[b] = f"The readings are explained as well by {what}, with {fewer}: {remedy}."
+    return score, said
 
 
 def _outliers(problem: Problem, settings: Settings) -> list[Cycle]:
@@ -349,12 +371,13 @@ def diagnose(
     determined = [own for own in (problem.of(unknowns) for unknowns, _ in parts) if own.determined]
     richest = max(reversed(determined), key=lambda own: own.state.loads.size)
     wanted = torch.zeros(B, dtype=torch.bool)  # a robot that is off is so in all samples
-    refused_at = (~fit.accepted & torch.isfinite(fit.chi2)).nonzero().squeeze(-1)
-    wanted[refused_at[torch.linspace(0, len(refused_at) - 1, min(MOST_SUSPECTED, len(refused_at))).round().long()]] = True
+    for some in (~fit.accepted & torch.isfinite(fit.chi2), fit.accepted):
+        at = some.nonzero().squeeze(-1)
+        wanted[at[torch.linspace(0, len(at) - 1, min(MOST_SUSPECTED, len(at))).round().long()]] = True
     for unknowns, index in parts:
         own = problem.of(unknowns)
         tip_instead[index] = len(parts) > 1 and unknowns.tip != "none" and problem.unknowns.tip == "none"
-        chosen = len(parts) > 1 and own.state.external.stop > 4
+        chosen = len(parts) > 1 and own.state.external.stop > 0
         doubtful = torch.isfinite(fit.chi2[index]) & (~fit.accepted[index] | chosen) & own.take(index).usable
         for rows in index[doubtful].split(CHUNK):
             refused = rows[~fit.accepted[rows]]

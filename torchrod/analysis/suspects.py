@@ -125,8 +125,8 @@ def suspected(problem: Problem, x: Float[Tensor, "b n"], settings: Settings) -> 
 
 def _score(own: Problem, fit: Estimate, price: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
     """-2 log p, inf where the fit is not accepted. price: what is to be paid for what is not a load."""
-    by_loads = free_parameters(own) * torch.log(own.seen.clamp(min=3).to(fit.chi2.dtype))
-    return torch.where(fit.accepted, fit.chi2 + by_loads + price, torch.inf)
+    free = (free_parameters(own) + own.state.registration.size) * torch.log(own.seen.clamp(min=3).to(fit.chi2.dtype))
+    return torch.where(fit.accepted, fit.chi2 + free + price, torch.inf)
 
 
 def _narrowed(own: Problem, fit: Estimate) -> Float[Tensor, " b"]:
