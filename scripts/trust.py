@@ -35,8 +35,8 @@ def main() -> None:
         "--samples",
         type=int,
         default=1000,
-        help="runs per row; missing markers take four times as many, z-scores half, the base frame two fifths, noise, drag and "
-        "robots a fifth, mistakes a 25th",
+        help="runs per row; missing markers take four times as many, z-scores and robots half, the base frame two fifths, noise "
+        "and drag a fifth, mistakes a 25th",
     )
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="sections; coverage and frame go together")
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
@@ -54,7 +54,7 @@ def main() -> None:
         "frame": lambda: frame.run(max(2 * samples // 5, 5), right),
         "drag": lambda: drag.run(max(samples // 5, 4)),
         "scores": lambda: scores.run(max(samples // 2, 4)),
-        "robots": lambda: robots.run(max(samples // 5, 4)),
+        "robots": lambda: robots.run(max(samples // 2, 4)),
     }
     kept = sections(path.read_text(encoding="utf-8")) if path.exists() and set(options.parts) != set(PARTS) else {}
     for name in (name for name in PARTS if name in options.parts):
