@@ -478,3 +478,25 @@ def test_the_resultant_is_without_the_weight_that_the_robot_has(robot):
         assert problem.deviations is not None
         other, _ = OVERALL.found_at(robot(), dict(zip(problem.deviations.names, errors, strict=True)))
         assert torch.allclose(problem.own_weight(x)[b], other.rod.mass * other.gravity)
+
+
+@pytest.mark.parametrize("command", ["estimate", "observability"])
+def test_a_strip_that_bears_less_than_is_stated_is_refused_by_the_commands(command, tmp_path, capsys):
+    robot, shapes = tmp_path / "strip.toml", tmp_path / "s.csv"
+    K = "K_se = [1e5, 1e5, 3e5]\nK_bt = [1.2, 0.0013, 0.03]"
+    robot.write_text(f'name = "strip"\n[rod]\nlength = 0.3\n{K}\n[uncertainty]\noval = 0.1\n')
+    shapes.write_text("s,x,y,z\n" + "".join(f"{0.03 * k},0,0,{0.03 * k}\n" for k in range(1, 11)))
+    asked = [str(robot), *([str(shapes)] if command == "estimate" else ["--markers", "10"]), "--noise", "1e-3"]
+    assert main([command, *asked]) == 2
+    said = capsys.readouterr().err
+    assert str(robot) in said and "oval is 0.1, more than the rod's softer side has" in said and said.count("\n") == 1
+
+
+def test_parameters_are_those_of_the_robot_whatever_was_asked_before():
+    """Of two robots alike but for the mass per length, with a mass at the tip, one has a mass that may be off."""
+    stated = Uncertainty(stiffness=0.05, mass=0.1)
+    for mass in (0.05, 0.0, 0.05):
+        rod = replace(steel_rod().rod, mass_per_length=T(mass), masses=T([[0.4, 0.02]]))
+        problem = problem_of(Robot(rod, gravity=T([0.0, 3.0, -9.0])), stated)
+        assert problem.deviations is not None and problem.state.parameters.size == len(problem.deviations.names) == 1 + (mass > 0)
+        assert torch.isfinite(problem.h(torch.zeros(2, problem.size), False)).all()

@@ -305,7 +305,7 @@ def _by_robot(
     score, said = torch.full_like(own, torch.inf), [""] * len(own)
     count, accepted = getattr(problem.unknowns.loads, "count", 0), torch.isfinite(own)
     tried = [(count, problem.unknowns, wanted)]
-    tried += [(k, _with_loads(problem.unknowns, k), wanted & accepted) for k in sorted({1, count - 1} - {count})]
+    tried += [(k, _with_loads(problem.unknowns, k), wanted & accepted) for k in sorted({1, count - 1}) if k < count]
     for loads, unknowns, which in tried:
         index = which.nonzero().squeeze(-1)
         if unknowns is None or not len(index) or not (part := problem.of(unknowns).take(index)).determined:

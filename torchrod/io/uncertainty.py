@@ -95,6 +95,14 @@ class NearlyKnown:
         return _wider(self.frame, self.shared_frame)
 
 
+def fits(uncertainty: Uncertainty | None, robot: Robot, path: str | Path) -> None:
+    """Raise InputError, naming the file, where what it states cannot be of its robot."""
+    try:
+        _ = uncertainty is None or uncertainty.parameters(robot)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
 def _wider(a: Registration | None, b: Registration | None) -> Registration | None:
     if a is None or b is None:
         return a or b

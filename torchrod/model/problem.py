@@ -91,7 +91,7 @@ class Problem(Float64):
         """The blocks of x, bound to this robot's scales."""
         rod = self.robot.rod
         scales = key(self.unknowns), rod.length, rod.bending_stiffness, rod.force_scale, len(self.robot.tendons)
-        scales = (*scales, self.robot.weightless)
+        scales = (*scales, self.robot.weightless, bool(rod.mass_per_length > 0))  # what parameters there are
         return _states(scales, lambda: self.unknowns.state(self.robot))
 
     @property
