@@ -21,7 +21,7 @@ from ..io import (
     Noises,
     Result,
     Shapes,
-    fits,
+    check_parameters,
     read_base_pose,
     read_robot,
     read_shapes,
@@ -195,7 +195,7 @@ def _problem(options: Namespace, robot: Robot, nearly: NearlyKnown, shapes: Shap
             stacklevel=2,
         )
     own = nearly.of_a_sample
-    fits(own, robot, options.robot)
+    check_parameters(own, robot, options.robot)
     if own is not None and own.oval > ROUGHLY:
         warnings.warn(
             f"{options.robot}: uncertainty: oval is {own.oval:g}; above {ROUGHLY:g} intervals are too narrow now and then, so "

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..analysis.marker_placement import Placement, even_layout, place
 from ..analysis.observability import BENDS, LOCALIZED, Observability, bounds
-from ..io import fits, read_robot, read_uncertainty, write_observability, write_observability_table
+from ..io import check_parameters, read_robot, read_uncertainty, write_observability, write_observability_table
 from ..mechanics.robot import Robot
 from ..model.uncertainty import KINDS, Uncertainty
 from ..model.unknowns import Registration
@@ -40,7 +40,7 @@ def observability(options: Namespace) -> None:
     writable(options.json, (".json",))
     nearly = read_uncertainty(options.robot)
     registration, uncertainty = _registration(options) or nearly.frame_of_a_sample, nearly.of_a_sample
-    fits(uncertainty, robot, options.robot)
+    check_parameters(uncertainty, robot, options.robot)
     placed = None
     if options.place is not None:
         try:

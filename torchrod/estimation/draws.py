@@ -33,7 +33,7 @@ from ..util.threads import one_thread
 from . import filter as ekf
 from .chart import FAINT, Chart
 from .elsewhere import across_strip, elsewhere, fits_elsewhere
-from .evaluator import Evaluator, KernelEvaluator, MisreadEvaluator, SensorEvaluator, evaluator
+from .evaluator import Evaluator, Walked, evaluator
 from .pareto import GOOD, effective_size, smoothed
 from .result import Estimate
 from .solve import Settings, solver_of
@@ -230,7 +230,7 @@ class _Target:
         chart, evaluate = self._of(index, D)
         y, log_volume = chart.back(v)
         flat, rows = y.flatten(0, 1), index.repeat_interleave(D)
-        by_walks = self.walks and isinstance(evaluate, KernelEvaluator | SensorEvaluator | MisreadEvaluator)
+        by_walks = self.walks and isinstance(evaluate, Walked)
         cost, x = self._by_walks(evaluate, flat, rows) if by_walks else self._by_newton(evaluate, flat, rows)
         cost, x = cost.unflatten(0, (b, D)), x.unflatten(0, (b, D))
         if by_walks and not self.bare:
@@ -245,7 +245,7 @@ class _Target:
         self, evaluate: Evaluator, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
         """The cost, by the forward solve from tip to base: one walk without weight. With the fit's prior, but where bare."""
-        assert isinstance(evaluate, KernelEvaluator | SensorEvaluator | MisreadEvaluator)
+        assert isinstance(evaluate, Walked)
         state, q_tip = self.problem.state, None if self.q_tip is None else self.q_tip[rows]
         x = torch.nn.functional.pad(y, (0, state.base.size))
         wrench, missed, line = evaluate.walk.balance(x, q_tip, 1, self.clamped)

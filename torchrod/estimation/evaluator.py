@@ -319,3 +319,6 @@ class MisreadEvaluator(TorchEvaluator):
     def line(self, x: Float[Tensor, "B n"]) -> Float[Tensor, "B P 3"]:
         """The centre line (m, the rod's own frame)."""
         return self._plain.line(x)
+
+
+Walked = KernelEvaluator | SensorEvaluator | MisreadEvaluator  # by the kernel, along the rod

@@ -8,7 +8,7 @@ from .robot_file import read_base_pose, read_robot
 from .robot_text import write_calibrated
 from .shape_file import read_shapes, write_shapes
 from .shapes import KINDS, Noises, Shapes
-from .uncertainty import Calibrated, NearlyKnown, fits, read_uncertainty
+from .uncertainty import Calibrated, NearlyKnown, check_parameters, read_uncertainty
 
 __all__ = [
     "CALIBRATION_SUFFIXES",
@@ -21,7 +21,7 @@ __all__ = [
     "Result",
     "Shapes",
     "calibrated_by",
-    "fits",
+    "check_parameters",
     "read_base_pose",
     "read_fit",
     "read_robot",

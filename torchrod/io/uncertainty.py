@@ -95,7 +95,7 @@ class NearlyKnown:
         return _wider(self.frame, self.shared_frame)
 
 
-def fits(uncertainty: Uncertainty | None, robot: Robot, path: str | Path) -> None:
+def check_parameters(uncertainty: Uncertainty | None, robot: Robot, path: str | Path) -> None:
     """Raise InputError, naming the file, where what it states cannot be of its robot."""
     try:
         _ = uncertainty is None or uncertainty.parameters(robot)

@@ -146,9 +146,9 @@ class Deviations:
                 found += (share.unsqueeze(-1) * sides).unbind(-1)
         found += [e[name] for name in self._bent]
         if counts.weight:
-            off, _ = turned_gravity(robot.gravity, torch.stack([e.get(name, zero) for name in GRAVITY], -1))
-            found += ((1 + e.get("mass", zero)).unsqueeze(-1) * off - robot.gravity).unbind(-1)
-            found += (off - robot.gravity).unbind(-1) if counts.weight > 3 else []
+            of_rod, of_points = (own - robot.gravity for own in self._pulled(e, zero))
+            found += of_rod.unbind(-1)
+            found += of_points.unbind(-1) if counts.weight > 3 else []
         if counts.pull:
             assert reading is not None
             tau, width = self._pull(e, reading, zero)
@@ -220,12 +220,17 @@ class Deviations:
 
     def own_weight(self, theta: Float[Tensor, "... k"]) -> Float[Tensor, "... 3"]:
         """Of the whole robot (N, base frame)."""
-        (e, zero), rod = self._errors(theta), self.robot.rod
-        g = self.robot.gravity
-        if self._heavy:
-            g, _ = turned_gravity(g, torch.stack([e.get(name, zero) for name in GRAVITY], -1))
-        more = (e.get("mass", zero) * float(rod.mass_per_length) * rod.length).unsqueeze(-1)
-        return (rod.mass + more) * g
+        rod = self.robot.rod
+        if not self._heavy:
+            return rod.mass * self.robot.gravity
+        at_points = float(rod.masses[:, 1].sum())
+        of_rod, of_points = self._pulled(*self._errors(theta))
+        return (rod.mass - at_points) * of_rod + at_points * of_points
+
+    def _pulled(self, e: Mapping[str, Tensor], zero: Tensor) -> tuple[Float[Tensor, "... 3"], Float[Tensor, "... 3"]]:
+        """What gravity (m/s^2) makes of each kg that the file gives the rod, and what hangs on it at points."""
+        g, _ = turned_gravity(self.robot.gravity, torch.stack([e.get(name, zero) for name in GRAVITY], -1))
+        return (1 + e.get("mass", zero)).unsqueeze(-1) * g, g
 
     def weight(self, kappa: Float[Tensor, "B m"]) -> Float[Tensor, "B 3"]:
         """Gravity force per length (N/m) of the rod, without what hangs at points, at amounts kappa."""
@@ -243,10 +248,26 @@ class Deviations:
         rows = dict(zip(self.names, self.root, strict=True))
         return torch.stack([rows.get(name, torch.zeros_like(self.root[0])) for name in (*SHIFT, *TURN, *STRAIN)])
 
+    def _changed(self, name: str, error: float) -> Robot:
+        """The prepared robot with one error."""
+        (change,) = (p.change for p in self.uncertainty.parameters(self.robot) if p.name == name)
+        assert change is not None
+        return change(self.prepared, error)
+
+    @cached_property
+    def _bent_robots(self) -> tuple[Robot, ...]:
+        """With one unit of each error of the reference curvature."""
+        return tuple(self._changed(name, 1.0) for name in self._bent)
+
+    @cached_property
+    def _sides(self) -> Mapping[str, tuple[float, tuple[Robot, Robot]]]:
+        """Errors of an oval section, and robots that are off by so much, to one side and to the other."""
+        step = SMALL * self.robot.rod.softer_side
+        return {n: (step, (self._changed(n, step), self._changed(n, -step))) for n in OVAL if n in self.names}
+
     def along(self, places: Grid | Places) -> Along:
         """T_m of (1) at the stages of a grid, or at places."""
         robot, counts, s, inside = self.prepared, self.counts, places.stages, places.inside
-        changes = {p.name: p.change for p in self.uncertainty.parameters(self.robot)}
 
         def stiffness(of: Robot) -> Float[Tensor, "S 3 18"]:
             rod = of.rod
@@ -255,18 +276,14 @@ class Deviations:
             return rows if rod.pieces is not None else rows.expand(1, 1, 18)
 
         def side(name: str) -> Float[Tensor, "S 3 18"]:
-            step, change = SMALL * robot.rod.softer_side, changes.get(name)
-            if change is None:
+            if name not in self._sides:
                 return torch.zeros_like(stiffness(robot))
-            return (stiffness(change(robot, step)) - stiffness(change(robot, -step))) / (2 * step)
+            step, (one, other) = self._sides[name]
+            return (stiffness(one) - stiffness(other)) / (2 * step)
 
         K = [stiffness(robot)] if counts.stiffness else []
         K += [side(name) for name in OVAL] if counts.stiffness > 1 else []
-        bent = []
-        for name in self._bent:
-            change = changes[name]
-            assert change is not None
-            bent.append(change(robot, 1.0).rod.curvature_at(s, inside) - robot.rod.curvature_at(s, inside))
+        bent = [other.rod.curvature_at(s, inside) - robot.rod.curvature_at(s, inside) for other in self._bent_robots]
         hanging, pulling = [], None
         if counts.weight:
             hanging.append(robot.rod.mass_per_length * robot.rod.length_beyond(s, inside))
@@ -279,11 +296,10 @@ class Deviations:
         of_K, of_u, of_W = (torch.stack(x) if x else None for x in (K, bent, hanging))
         return Along(of_K, of_u, of_W, pulling)
 
-    def moved(
-        self, robot: Robot, tension: Float[Tensor, "... T"] | None, kappa: Float[Tensor, "... m"], places: Grid | Places
-    ) -> StageTable:
-        """(1) at the stages of a grid, or at places, without loads; its section is there. robot: `prepared`, or like it."""
-        table, along = stage_table(robot, (), tension, places), self.along(places)
+    def moved(self, tension: Float[Tensor, "... T"] | None, kappa: Float[Tensor, "... m"], places: Grid | Places) -> StageTable:
+        """(1) at the stages of a grid, or at places, without loads; its section is there. tension: as it was read (N)."""
+        robot, along = self.prepared, self.along(places)
+        table = stage_table(robot, (), tension, places)
         of_K, of_u, of_W, of_pull, of_mu, of_place = kappa.split(self.counts, -1)
         W, u_star, t = table.loads.Wn, table.u_star, table.tendons
         of = table.section or Section.of(robot.rod.K_se.expand(1, 1, 3, 3), robot.rod.K_bt.expand(1, 1, 3, 3))

@@ -342,7 +342,7 @@ class Problem(Float64):
         if nearly is None:
             return stage_table(self.as_pulled, loads, self.pulling(x), places)
         kappa = nearly.amounts(x[..., self.state.parameters.at], self.tension)
-        table = nearly.moved(nearly.prepared, self.tension, kappa, places)
+        table = nearly.moved(self.tension, kappa, places)
         return replace(table, loads=table.loads + total(loads, places.stages, places.inside))
 
     def h(self, x: Float[Tensor, "... n"], differentiable: bool = True) -> Float[Tensor, "... z"]:
