@@ -2,6 +2,8 @@
 
 import json
 import math
+from argparse import Namespace
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +31,10 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.cli import main
+from torchrod.cli.estimate import _sampled
+from torchrod.estimation.draws import posterior_draws
 from torchrod.estimation.evaluator import KernelEvaluator, MisreadEvaluator, TorchEvaluator, evaluator
+from torchrod.estimation.intervals import intervals, resultant
 from torchrod.mechanics.jacobian import pointwise_jacobian
 from torchrod.model.deviations import Deviations
 from torchrod.model.uncertainty import Found
@@ -477,7 +482,31 @@ def test_the_resultant_is_without_the_weight_that_the_robot_has(robot):
     for b, errors in enumerate(problem.state.parameters.of(x).tolist()):
         assert problem.deviations is not None
         other, _ = OVERALL.found_at(robot(), dict(zip(problem.deviations.names, errors, strict=True)))
-        assert torch.allclose(problem.own_weight(x)[b], other.rod.mass * other.gravity)
+        weight = other.rod.mass * other.gravity
+        assert torch.allclose(problem.own_weight(x)[b], weight)
+        assert torch.allclose(resultant(problem, x.unsqueeze(1))[b, 0], problem.state.base.of(x)[b, :3] - weight)
+
+
+def test_draws_where_it_is_unknown_whether_tendons_rub():
+    """Theta is followed then, though the file has no friction: the base wrench comes by Newton steps, not by a walk from the tip."""
+    robot = busy_robot()
+    load = PointForces(0.5 * robot.rod.force_scale * T([[[0.6, 0.8, 0.0]]]), T([[0.25]]))
+    p = solve_shape(robot, (load,), T([[6.0, 3.0]]), S, 1).p
+    problem = Problem(robot, unknowns_of(robot, uncertainty=Uncertainty(friction=0.1)), [Markers(S, p, 4e-4)], T([[6.0, 3.0]]))
+    fit = estimate(problem)
+    found = intervals(posterior_draws(problem, fit))
+    low, high = found.location[0, 0].tolist()
+    assert low < 0.25 < high and high - low < 8 * float(fit.location_std)
+
+
+@pytest.mark.parametrize(("batch", "drawn"), [(10, True), (11, False)])
+def test_few_samples_are_drawn_by_default_where_tendons_may_rub_and_the_metric_is_unknown(batch, drawn):
+    robot = busy_robot()
+    unknowns = unknowns_of(robot, uncertainty=Uncertainty(friction=0.1, metric=0.01))
+    problem = Problem(robot, unknowns, [Markers(S, torch.zeros(batch, 20, 3), 1e-3)], torch.ones(batch, 2))
+    options = Namespace(out="r.json", plot=None, intervals=None, one_frame=False)
+    with nullcontext() if drawn else pytest.warns(UserWarning, match="intervals of 11 samples are those of the covariance"):
+        assert _sampled(options, problem, False) is drawn
 
 
 @pytest.mark.parametrize("command", ["estimate", "observability"])

@@ -123,8 +123,9 @@ class Walk:
     ) -> tuple[Float[Tensor, "B 6"], Float[Tensor, " B"], Float[Tensor, "B P 3"]]:
         """The base wrench (N, N m) in equilibrium under x, how far the base is from its clamp (rad), the centre line (m).
 
-        The base wrench that x has plays no part.
+        The base wrench that x has plays no part. Where tendons rub, the kernel does not walk from the tip.
         """
+        assert self.problem.on_grid.tendons.friction is None
         t = _tables(self.problem, self.nu, x if self._moves_nodes else None, readings=False)
         t = self._off(t, x, False)
         return kernel.balance_now(x, q_tip, increments, tolerance, t.structure, t.markers)
