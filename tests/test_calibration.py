@@ -199,7 +199,7 @@ def test_a_parameter_that_does_not_show_is_named():
     s = torch.linspace(0.1, 0.56, 5)
     found = calibrate(robot, Markers(s, solve_shape(robot, (), None, s, 1, STEPS).p, 1e-3), steps=STEPS)
     assert found.undetermined == ("mass_per_length",)
-    assert "hardly determine mass_per_length" in found.message
+    assert "hardly determine mass_per_length" in found.message and "--hold-mass" in found.message
 
 
 @pytest.mark.many_fits

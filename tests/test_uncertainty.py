@@ -488,7 +488,7 @@ def test_the_resultant_is_without_the_weight_that_the_robot_has(robot):
 
 
 def test_draws_where_it_is_unknown_whether_tendons_rub():
-    """Theta is followed then, though the file has no friction: the base wrench comes by Newton steps, not by a walk from the tip."""
+    """Theta is followed then, though the file has no friction: the base wrench comes by Newton steps, not by a walk."""
     robot = busy_robot()
     load = PointForces(0.5 * robot.rod.force_scale * T([[[0.6, 0.8, 0.0]]]), T([[0.25]]))
     p = solve_shape(robot, (load,), T([[6.0, 3.0]]), S, 1).p

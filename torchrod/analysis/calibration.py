@@ -136,9 +136,10 @@ class Calibration:
                 "from a mass_per_length nearer the truth, or allow more iterations."
             )
         if self.undetermined:
+            held = " (--hold-mass keeps the file's mass)" if MASS in self.undetermined else ""
             return (
                 f"Converged, but these shapes hardly determine {', '.join(self.undetermined)}: add shapes at other tensions "
-                "or with gravity across the rod, or ask for fewer parameters."
+                f"or with gravity across the rod, or ask for fewer parameters{held}."
             )
         twins = "".join(f" These shapes do not tell {a} from {b}; only their common effect is known." for a, b in self.alike)
         if not self.accepted:

@@ -19,9 +19,10 @@ anywhere along the rod with the same probability, and of any size,
 
 even in log |F| between the least force worth telling (f = FAINT) and the fit's own weak prior (w), F being the d components of all
 loads together: normal forces whose common size may be any. Of loads one by one, the prior would take one of two close pushes to be
-next to nothing. The unknown force and the moment at the tip have (2) each for itself, across the base's
-axis and along it. Widths, tensions and the base frame's error
-keep their priors, and so does all that a problem has a prior of its own for.
+next to nothing. The unknown force and the moment at the tip have (2) each for itself, across the base's axis and along it, and so
+has a strip's soft side, and what pushes across it. What only weighs on what bends the rod already is even up to where it bends the
+rod by itself (f = BUCKLES, TWISTS, GIVES_WAY): smaller amounts are as hard to see as none, and no likelier. Widths, tensions and
+the base frame's error keep their priors, and so does all that a problem has a prior of its own for.
 """
 
 import math
@@ -38,13 +39,17 @@ from ..model.problem import TIP_ROWS, Problem
 from ..model.unknowns import TIP_STD
 from ..util.precision import DTYPE
 from . import filter as ekf
+from .elsewhere import across_strip
 from .evaluator import evaluator
 
 PLACES = 24  # along the rod, at which a force is tried
 CELLS = 96  # between which the response is linear
 FAINT = 0.01  # in force and moment scales: what is weaker might as well be nothing
+BUCKLES = math.pi**2 / 16  # force scales: what is weaker along the rod only weighs on what bends it already
+TWISTS = 2.2  # moment scales, in the same way: 4.49 EI / L twist a straight rod off its axis
+GIVES_WAY = 1.0  # force scales, of a push across a strip, in the same way
 STEP = 1e-3  # of the differences in dv/dy
-TORQUE_STD = 3.0  # moment scales; 4.49 EI / L, 2.2 of them, twist a straight rod off its axis
+TORQUE_STD = 3.0  # moment scales
 
 
 @lru_cache(maxsize=32)
@@ -60,6 +65,23 @@ def _log_size(F: Float[Tensor, "... d"], weak: float, faint: float) -> Float[Ten
     """log p(F) of (2)."""
     d, square = F.shape[-1], F.square().sum(-1)
     return -0.5 * square / weak**2 - 0.5 * d * torch.log(faint**2 + square) - _log_normalizer(d, faint, weak)
+
+
+@dataclass(frozen=True)
+class _Sized:
+    """Entries that share a size by (2): with the deviation of their weak prior, and what is faint. axis: of lateral forces, only
+    what is along it in the section.
+    """
+
+    at: list[int]
+    weak: float
+    faint: float
+    axis: Float[Tensor, " 2"] | None = None
+
+    def of(self, y: Float[Tensor, "... m"]) -> Float[Tensor, "... d"]:
+        """What has that size."""
+        F = y[..., self.at]
+        return F if self.axis is None else F.unflatten(-1, (-1, 2)) @ self.axis
 
 
 @cache
@@ -318,21 +340,24 @@ class Chart:
         return ((self.to(y.unsqueeze(1) + step) - self.to(y.unsqueeze(1) - step)) / (2 * STEP)).mT
 
     @cached_property
-    def _scale_free(self) -> list[tuple[list[int], float, float]]:
-        """The entries that are forces or moments of any size, by which size they share, each with its weak prior's deviation and
-        what is faint: of a force on a flat rod beside what bends it along its soft side.
-        """
+    def _scale_free(self) -> list[_Sized]:
+        """The forces and moments of any size, each group with a size of its own."""
         loads, found = self.problem.unknowns.loads, []
         if self.problem.prior is not None:
             return found
         if isinstance(loads, GaussianCoordinates | PointCoordinates) and loads.force_std == WEAK_STD and loads.count:
             lateral = [loads.per_load * k + i for k in range(loads.count) for i in range(2)]
-            faint = FAINT * min(1.0, *self.problem.robot.rod.sides)
-            found.append((lateral + (self.along if loads.friction == math.inf else []), WEAK_STD, faint))
+            sides, across = self.problem.robot.rod.sides, across_strip(self.problem.robot.rod)
+            if across is None or loads.friction == math.inf:
+                along = self.along if loads.friction == math.inf else []
+                found.append(_Sized(lateral + along, WEAK_STD, FAINT * min(1.0, *sides)))
+            else:
+                soft = torch.stack([across[1], -across[0]])
+                found += [_Sized(lateral, WEAK_STD, FAINT * min(sides), soft), _Sized(lateral, WEAK_STD, GIVES_WAY, across)]
         tip = self.problem.state.tip.at
         for first in range(tip.start, tip.stop, 3):  # across the base's axis, and along it
-            along = TORQUE_STD if first > tip.start else TIP_STD
-            found += [([first, first + 1], TIP_STD, FAINT), ([first + 2], along, FAINT)]
+            along = (TORQUE_STD, TWISTS) if first > tip.start else (TIP_STD, BUCKLES)
+            found += [_Sized([first, first + 1], TIP_STD, FAINT), _Sized([first + 2], *along)]
         return found
 
     def fitted_prior(self, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"]:
@@ -345,9 +370,9 @@ class Chart:
         m, total = self.size, y.new_zeros(y.shape[:-1])
         mean, precision = ((v.unsqueeze(1) if v.ndim > 1 else v)[..., :m] for v in (self.problem.mean, self.problem.precision))
         normal = torch.ones(m, dtype=torch.bool)
-        for at, weak, faint in self._scale_free:
-            total = total + _log_size(y[..., at], weak, faint)
-            normal[at] = False
+        for sized in self._scale_free:
+            total = total + _log_size(sized.of(y), sized.weak, sized.faint)
+            normal[sized.at] = False
         for i in self.places if self.problem.prior is None else ():
             total = total + torch.nn.functional.logsigmoid(y[..., i]) + torch.nn.functional.logsigmoid(-y[..., i])
             normal[i] = False

@@ -5,11 +5,12 @@ gives: by a walk from the tip, or a few where weight acts, else by Newton steps 
 
     (1)  log pi(v) = -cost(x(v)) / 2 + log p(y) + log |det dy/dv|
 
-with the cost of what was read alone, the prior p of estimation.chart, and (2) the weights w = pi / q of draws from q, a Student's t
-about the fit with the fit's covariance, Pareto-smoothed (estimation.pareto). Where k-hat says that q is no proposal for pi, q is
-matched to the weighted mean and covariance of what was drawn so far, and all draws count by the mixture they came from (adaptive
-multiple importance sampling, Cornuet et al. 2012). Where that does not help, draws go from q to pi through q^(1 - b) pi^b with
-Metropolis steps in between, b as large as half of the draws survive (sequential Monte Carlo, Del Moral et al. 2006).
+with the cost of what was read alone, the prior p of estimation.chart, and (2) the weights w = pi / q of draws from q, Student's t
+about the fit with the fit's covariance and about others along its valley (estimation.valley), Pareto-smoothed (estimation.pareto).
+Where k-hat says that q is no proposal for pi, q is matched to the weighted mean and covariance of what was drawn so far, and all
+draws count by the mixture they came from (adaptive multiple importance sampling, Cornuet et al. 2012). Where that does not help,
+draws go from q to pi through q^(1 - b) pi^b with Metropolis steps in between, b as large as half of the draws survive (sequential
+Monte Carlo, Del Moral et al. 2006).
 
 The random numbers are always the same: equal fits have equal draws, whatever their batch.
 """
@@ -18,13 +19,10 @@ import itertools
 import math
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
-from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.special import chdtri
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from ..model.problem import TIP_ROWS, Problem
 from ..util.precision import DTYPE
@@ -32,15 +30,17 @@ from ..util.status import Status
 from ..util.threads import one_thread
 from . import filter as ekf
 from .chart import FAINT, Chart
-from .elsewhere import across_strip, elsewhere, fits_elsewhere
+from .elsewhere import across_strip, elsewhere, fits_elsewhere, marks
 from .evaluator import Evaluator, Walked, evaluator
 from .pareto import GOOD, effective_size, smoothed
+from .proposal import Mixture, OnGrid, Proposal, Student, combinations
 from .result import Estimate
 from .solve import Settings, solver_of
+from .valley import line_of, valley
 
 DRAWS = 512  # a power of two
 ROWS = 32768  # draws evaluated at a time
-NU = 8.0  # degrees of freedom of the proposal
+PLAIN = Settings(restarts=(), basins=0, sized=False)
 WIDEST = 2.5  # of eta: a place that may be anywhere has 1.8
 STRAIGHT = 0.5  # of eta: what goes with a place less sure than that, to first order, goes astray
 CELLS = {1: 96, 2: 48, 3: 24}  # along the rod, of the histogram of so many places
@@ -52,7 +52,7 @@ FARTHEST = 4.0  # |eta| of the proposal's centre
 MOST_OTHERS = 2  # fits of a sample
 HARDLY = 0.02  # of the draws: of a fit with fewer nobody is told whether its weights can be trusted
 ENOUGH = 0.1  # of the draws: a smaller effective size asks for another round,
-ON_STRIP = 0.25  # and on a strip: forces across it and along its soft side trade along a curve, of which one end may be missed
+ON_STRIP = 0.4  # and on a strip: forces across it and along its soft side trade along a curve, of which one end may be missed
 PLENTY = 0.3  # with so many, a k-hat up to 1 will do
 ROUNDS = 3  # of matched proposals
 SURVIVE = 0.5  # of the draws, from one temperature to the next
@@ -103,90 +103,6 @@ class Draws:
         return Draws(self.problem.take(index), **own)
 
 
-@cache
-def _student(size: int, count: int, seed: int) -> Float[Tensor, "D m"]:
-    """Points of a standard Student's t with NU degrees of freedom in so many dimensions: Sobol points, always the same."""
-    uniform = SobolEngine(size + 1, scramble=True, seed=seed).draw(count, dtype=DTYPE).clamp(1e-9, 1 - 1e-9)
-    spread = torch.from_numpy(chdtri(NU, uniform[:, -1].numpy()))
-    return torch.special.ndtri(uniform[:, :-1]) * (NU / spread).sqrt().unsqueeze(-1)
-
-
-@dataclass(frozen=True)
-class _Proposal:
-    """Student's t of b samples: centre (b, m), and L with L L^T its scale matrix."""
-
-    centre: Float[Tensor, "b m"]
-    L: Float[Tensor, "b m m"]
-
-    @classmethod
-    def of(cls, centre: Float[Tensor, "b m"], C: Float[Tensor, "b m m"]) -> "_Proposal":
-        """By a factor of C, of which directions that are none are given a little."""
-        d = C.diagonal(dim1=-2, dim2=-1).clamp(min=1e-24).sqrt()
-        size, axes = torch.linalg.eigh(C / d.unsqueeze(-1) / d.unsqueeze(-2))
-        R = (axes * size.clamp(min=1e-10).sqrt().unsqueeze(-2)).mT
-        L = torch.linalg.qr(R)[1].mT
-        return cls(centre, d.unsqueeze(-1) * L * L.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2))
-
-    def take(self, index: Int[Tensor, " c"]) -> "_Proposal":
-        return _Proposal(self.centre[index], self.L[index])
-
-    def draw(self, count: int, seed: int) -> Float[Tensor, "b D m"]:
-        return self.centre.unsqueeze(1) + _student(self.centre.shape[-1], count, seed) @ self.L.mT
-
-    def log_density(self, v: Float[Tensor, "b D m"]) -> Float[Tensor, "b D"]:
-        m = v.shape[-1]
-        off = torch.linalg.solve_triangular(self.L, (v - self.centre.unsqueeze(1)).mT, upper=False)
-        constant = math.lgamma((NU + m) / 2) - math.lgamma(NU / 2) - 0.5 * m * math.log(NU * math.pi)
-        size = self.L.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1, keepdim=True)
-        return constant - size - 0.5 * (NU + m) * torch.log1p(off.square().sum(-2) / NU)
-
-
-@cache
-def _combinations(cells: int, K: int) -> tuple[Int[Tensor, "c K"], Int[Tensor, " lut"]]:
-    """K cells in rising order, and which combination each K cells are, by their number in the base `cells`; -1: none."""
-    cell = torch.combinations(torch.arange(cells), K)
-    base = cells ** torch.arange(K)
-    return cell, torch.full((cells**K,), -1).index_copy(0, (cell * base).sum(-1), torch.arange(len(cell)))
-
-
-@dataclass(frozen=True)
-class _OnGrid:
-    """Places of the loads by a histogram of how probable they are, all else by a Student's t.
-
-    rest: that t, of the other entries. places: those of the etas, in the order along the rod. share (b, c): of each combination.
-    """
-
-    rest: _Proposal
-    places: Int[Tensor, "b K"]
-    others: Int[Tensor, " r"]
-    cells: int
-    share: Float[Tensor, "b c"]
-
-    def take(self, index: Int[Tensor, " c"]) -> "_OnGrid":
-        return replace(self, rest=self.rest.take(index), places=self.places[index], share=self.share[index])
-
-    def draw(self, count: int, seed: int) -> Float[Tensor, "b D m"]:
-        (b, K), r = self.places.shape, len(self.others)
-        uniform = SobolEngine(K + 1, scramble=True, seed=100 + seed).draw(count, dtype=DTYPE).clamp(1e-6, 1 - 1e-6)
-        ends = self.share.cumsum(-1)
-        which = torch.searchsorted((ends / ends[:, -1:]).contiguous(), uniform[:, 0].expand(b, -1).contiguous())
-        cell, _ = _combinations(self.cells, K)
-        eta = torch.logit((cell[which.clamp(max=len(cell) - 1)] + uniform[:, 1:]) / self.cells)
-        v = eta.new_zeros(b, count, K + r)
-        v[..., self.others] = self.rest.draw(count, seed)
-        return v.scatter(-1, self.places.unsqueeze(1).expand(-1, count, -1), eta)
-
-    def log_density(self, v: Float[Tensor, "b D m"]) -> Float[Tensor, "b D"]:
-        K = self.places.shape[-1]
-        at = torch.sigmoid(v.gather(-1, self.places.unsqueeze(1).expand(-1, v.shape[1], -1)))
-        cell = (at * self.cells).long().clamp(max=self.cells - 1)
-        _, table = _combinations(self.cells, K)
-        which = table[(cell * self.cells ** torch.arange(K)).sum(-1)]
-        share = torch.where(which >= 0, self.share.gather(-1, which.clamp(min=0)), 0.0)
-        slope = (at * (1 - at)).clamp(min=1e-300).log().sum(-1) + K * math.log(self.cells)
-        return share.log() + slope + self.rest.log_density(v[..., self.others])
-
-
 def _exactly(problem: Problem) -> Problem:
     """The problem on as many steps as its markers can tell."""
     markers = problem.markers
@@ -201,20 +117,28 @@ class _Target:
 
     def __init__(self, problem: Problem, x: Float[Tensor, "B n"], C: Float[Tensor, "B n n"], nu: float):
         self.problem, self.nu, self.x = _exactly(problem), nu, x
+        self.valley = valley(self.problem, x, C, solver_of(PLAIN))
         self.chart = Chart.at(self.problem, x)
         m = self.chart.size
-        follow = ekf.solve_spd(C[:, :m, :m], C[:, :m, m:]).mT if m else C.new_zeros(len(C), TIP_ROWS, 0)
-        self.follow = follow.nan_to_num(0.0)  # d alpha / dy along the equilibria near the fit
+        each = self.valley.C.flatten(0, 1)
+        follow = ekf.solve_spd(each[:, :m, :m], each[:, :m, m:]).mT if m else each.new_zeros(len(each), TIP_ROWS, 0)
+        self.follow = follow.nan_to_num(0.0).unflatten(0, self.valley.sound.shape)  # d alpha / dy along the equilibria near each
         self._spread: tuple[Int[Tensor, " b"], int, Chart, Evaluator] | None = None
         state, robot = problem.state, problem.robot
         smooth = self.problem.on_grid.tendons.friction is None
         self.walks = not (state.tip.size or state.tension.size) and robot.gravity.ndim == 1 and smooth
-        self.q_tip = None if robot.weightless or not self.walks else self.problem.shape(x, differentiable=False).tip_q
+        self.q_tip = None if robot.weightless or not self.walks else self._at_tip()
         markers = self.problem.markers
         plain = markers is not None and markers.isotropic and markers.offsets is None
         self.bare = plain and math.isinf(nu) and not (state.registration.size or state.parameters.size)
         least = float(self.problem.weights[:, :-TIP_ROWS].max()) ** -0.5 / robot.rod.length if plain else 0.0
         self.clamped = max(CLAMPED * least, LEAST_CLAMPED)
+
+    def _at_tip(self) -> Float[Tensor, "B S 4"]:
+        """How the tip of each fit of the valley is turned."""
+        B, S = self.valley.sound.shape
+        many = self.problem.take(torch.arange(B).repeat_interleave(S))
+        return many.shape(self.valley.x.flatten(0, 1), differentiable=False).tip_q.unflatten(0, (B, S))
 
     def _of(self, index: Int[Tensor, " b"], count: int) -> tuple[Chart, Evaluator]:
         """The chart of samples of an index, and the evaluator of so many draws of each."""
@@ -246,7 +170,7 @@ class _Target:
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
         """The cost, by the forward solve from tip to base: one walk without weight. With the fit's prior, but where bare."""
         assert isinstance(evaluate, Walked)
-        state, q_tip = self.problem.state, None if self.q_tip is None else self.q_tip[rows]
+        state, q_tip = self.problem.state, None if self.q_tip is None else self.q_tip[rows, self._nearest(y, rows)]
         x = torch.nn.functional.pad(y, (0, state.base.size))
         wrench, missed, line = evaluate.walk.balance(x, q_tip, 1, self.clamped)
         x = torch.cat([y, wrench / state.base.unit], -1)
@@ -263,8 +187,9 @@ class _Target:
     ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N n"]]:
         """The cost without the prior, by Newton steps on the base wrench until the tip residual is nothing."""
         m = self.chart.size
-        off = y - self.x[rows, :m]
-        x = torch.cat([y, self.x[rows, m:] + (self.follow[rows] @ off.unsqueeze(-1)).squeeze(-1)], -1)
+        nearest = self._nearest(y, rows)
+        near, follow = self.valley.x[rows, nearest], self.follow[rows, nearest]
+        x = torch.cat([y, near[:, m:] + (follow @ (y - near[:, :m]).unsqueeze(-1)).squeeze(-1)], -1)
         cost = x.new_full((len(x),), torch.inf)
         live = torch.arange(len(x))
         for _ in range(NEWTON):
@@ -281,8 +206,15 @@ class _Target:
                 break
         return cost, x
 
+    def _nearest(self, y: Float[Tensor, "N m"], rows: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+        """Which of the fits of its sample is nearest."""
+        if self.valley.sound.shape[1] == 1:
+            return torch.zeros_like(rows)
+        away = (marks(self.problem, y).unsqueeze(1) - marks(self.problem, self.valley.x)[rows]).norm(dim=-1)
+        return away.masked_fill(~self.valley.sound[rows], torch.inf).nan_to_num(torch.inf).argmin(-1)
 
-def _matched(v: Float[Tensor, "b D m"], log_weight: Float[Tensor, "b D"]) -> _Proposal:
+
+def _matched(v: Float[Tensor, "b D m"], log_weight: Float[Tensor, "b D"]) -> Student:
     """From the weighted mean and covariance; where few draws have all of the weight, of weights to a small power."""
     m, power = v.shape[-1], log_weight.new_ones(len(v), 1)
     flat = log_weight.clamp(min=-1e4)
@@ -293,7 +225,7 @@ def _matched(v: Float[Tensor, "b D m"], log_weight: Float[Tensor, "b D"]) -> _Pr
     weight = torch.softmax(power * flat, -1)
     centre = (weight.unsqueeze(-1) * v).sum(1)
     off = v - centre.unsqueeze(1)
-    return _Proposal.of(centre, 1.1 * (weight.unsqueeze(-1) * off).mT @ off)
+    return Student.of(centre, 1.1 * (weight.unsqueeze(-1) * off).mT @ off)
 
 
 def systematic(weight: Float[Tensor, "b D"], count: int) -> Int[Tensor, "b C"]:
@@ -329,7 +261,7 @@ class _Found:
         return _Found(*(getattr(self, f.name)[rows] for f in fields(_Found)))
 
 
-def _importance(target: _Target, first: list[tuple["_Proposal | _OnGrid", int]], count: int) -> _Found:
+def _importance(target: _Target, first: list[tuple[Proposal, int]], count: int) -> _Found:
     """(2), with as many rounds of matched proposals as k-hat asks for, and tempering where that does not help.
 
     first: the proposals to begin with, and how many draws of each, `count` in all.
@@ -370,7 +302,7 @@ def _importance(target: _Target, first: list[tuple["_Proposal | _OnGrid", int]],
     return found
 
 
-def _of(rows: Int[Tensor, " c"], proposals: list["_Proposal | _OnGrid"], *tensors: Tensor) -> tuple:
+def _of(rows: Int[Tensor, " c"], proposals: list[Proposal], *tensors: Tensor) -> tuple:
     return [p.take(rows) for p in proposals], *(t[rows] for t in tensors)
 
 
@@ -379,7 +311,7 @@ def _poor(found: _Found, enough: float) -> Bool[Tensor, " b"]:
 
 
 def _weighed(
-    proposals: list["_Proposal | _OnGrid"],
+    proposals: list[Proposal],
     shares: list[int],
     v: Float[Tensor, "b D m"],
     log_pi: Float[Tensor, "b D"],
@@ -400,7 +332,7 @@ class _Walkers:
 
     target: _Target
     index: Int[Tensor, " c"]
-    q: _Proposal
+    q: Student
     v: Float[Tensor, "c D m"]
     log_pi: Float[Tensor, "c D"]
     x: Float[Tensor, "c D n"]
@@ -424,7 +356,7 @@ class _Walkers:
         """A Metropolis step of every draw, alternately along the draws' covariance and along the difference of two of them."""
         _, D, m = self.v.shape
         off = self.v - self.v.mean(1, keepdim=True)
-        L = _Proposal.of(self.v[:, 0], off.mT @ off / D).L
+        L = Student.of(self.v[:, 0], off.mT @ off / D).L
         z = torch.randn(D, m, generator=self.random, dtype=DTYPE)
         i, j = (torch.randperm(D, generator=self.random) for _ in range(2))
         uniform, jump = torch.rand(D, generator=self.random, dtype=DTYPE), torch.rand(D, generator=self.random, dtype=DTYPE)
@@ -463,7 +395,7 @@ def _next_share(log_ratio: Float[Tensor, "c D"], left: Float[Tensor, " c"]) -> F
     return torch.where(whole, left, low.clamp(min=1e-6).minimum(left))
 
 
-def _tempered(target: _Target, index: Int[Tensor, " c"], q: _Proposal, count: int) -> _Found:
+def _tempered(target: _Target, index: Int[Tensor, " c"], q: Student, count: int) -> _Found:
     """Sequential Monte Carlo from q to pi."""
     v = q.draw(count, 20)
     log_pi, x = target(v, index)
@@ -488,7 +420,7 @@ def _tempered(target: _Target, index: Int[Tensor, " c"], q: _Proposal, count: in
     return _Found(walkers.x, level, k, ess, torch.where(b >= 1, evidence, torch.nan), torch.full((c,), int(Method.TEMPERED)))
 
 
-def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple["_Proposal | _OnGrid", int]]:
+def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple[Proposal, int]]:
     """The first proposals: the fit's covariance in the coordinates of the chart and, for some of the draws, places anywhere, and
     less at the tip.
     """
@@ -501,10 +433,10 @@ def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple
     C_y = C[:, :m, :m]
     C = J @ C_y @ J.mT
     less = [
-        _Proposal.of(chart.to(centre.unsqueeze(1)).squeeze(1), J @ own @ J.mT) for centre, own in _less_at_the_tip(target, y, C_y)
+        Student.of(chart.to(centre.unsqueeze(1)).squeeze(1), J @ own @ J.mT) for centre, own in _less_at_the_tip(target, y, C_y)
     ]
     if chart.response is None:
-        return _sharing([_Proposal.of(near, C)], less, count)
+        return _sharing([Student.of(near, C)], less, count)
     at, others = torch.tensor(chart.places), torch.tensor([i for i in range(m) if i not in chart.places])
     C_at, C_both = C[:, at][:, :, at], C[:, others][:, :, at]
     follow = ekf.solve_spd(C_at, C_both.mT).mT.nan_to_num(0.0)
@@ -517,10 +449,10 @@ def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple
     whole[:, at.unsqueeze(-1), at], whole[:, others.unsqueeze(-1), at] = C_at, follow @ C_at
     whole[:, at.unsqueeze(-1), others] = (follow @ C_at).mT
     whole[:, others.unsqueeze(-1), others] = C_rest + follow @ C_at @ follow.mT
-    local = _Proposal.of(near, whole)
+    local = Student.of(near, whole)
     if K not in CELLS:
         return _sharing([local], less, count)
-    cell, _ = _combinations(CELLS[K], K)
+    cell, _ = combinations(CELLS[K], K)
     eta = torch.logit((cell.to(DTYPE) + 0.5) / CELLS[K])
     order = chart.in_order
     rank = (order.unsqueeze(-1) == at).long().argmax(1) if K > 1 else torch.zeros(len(y), 1, dtype=torch.int64)
@@ -529,11 +461,40 @@ def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple
     share = (1 - ANYWHERE) * torch.softmax(FLATTER * log_share, -1) + ANYWHERE / len(cell)
     centre = near[:, others].clone()
     centre[:, [i for i, k in enumerate(others.tolist()) if k in chart.linear.tolist()]] = 0.0
-    grid = _OnGrid(_Proposal.of(centre, C_rest), order, others, CELLS[K], share)
-    return _sharing([local, grid], less, count)
+    grid = OnGrid(Student.of(centre, C_rest), order, others, CELLS[K], share)
+    return _with_valley(target, _sharing([local, grid], less, count))
 
 
-def _sharing(first: list["_Proposal | _OnGrid"], less: list[_Proposal], count: int) -> list[tuple["_Proposal | _OnGrid", int]]:
+def _with_valley(target: _Target, first: list[tuple[Proposal, int]]) -> list[tuple[Proposal, int]]:
+    """Half of the draws to the fits along the valley, where there is one, each by what can be told of it beforehand."""
+    if line_of(target.problem) is None:
+        return first
+    valley, chart, m = target.valley, target.chart, target.chart.size
+    B, S = valley.sound.shape
+    y = valley.x[..., :m].clone()
+    y[..., chart.places] = y[..., chart.places].clamp(-FARTHEST, FARTHEST)
+    v, parts = chart.to(y), []
+    for j in range(S):
+        slope = chart.slope(y[:, j])
+        parts.append(Student.of(v[:, j], _no_wider(chart, slope @ valley.C[:, j, :m, :m] @ slope.mT)))
+    log_size = torch.stack([part.L.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1) for part in parts], -1)
+    log_pi, _ = target(v, torch.arange(B))
+    log_share = (FLATTER * (log_pi + log_size)).masked_fill(~valley.sound, -torch.inf)
+    even = valley.sound / valley.sound.sum(-1, keepdim=True)
+    share = (1 - ANYWHERE) * torch.softmax(log_share, -1).nan_to_num(0.0) + ANYWHERE * even
+    half = [(p, k // 2) for p, k in first]
+    return [*half, (Mixture(parts, share), sum(k for _, k in first) - sum(k for _, k in half))]
+
+
+def _no_wider(chart: Chart, C: Float[Tensor, "b m m"]) -> Float[Tensor, "b m m"]:
+    """The covariance with places no less sure than WIDEST."""
+    at = torch.tensor(chart.places)
+    shrink = C.new_ones(C.shape[:2])
+    shrink[:, at] = (WIDEST / C.diagonal(dim1=-2, dim2=-1)[:, at].sqrt()).clamp(max=1.0)
+    return C * shrink.unsqueeze(-1) * shrink.unsqueeze(-2)
+
+
+def _sharing(first: list[Proposal], less: list[Student], count: int) -> list[tuple[Proposal, int]]:
     """Half of the draws to those that are there always, where there are others."""
     main = count // 2 if less else count
     shared = [(p, main // len(first)) for p in first] + [(p, (count - main) // len(less)) for p in less]
@@ -564,7 +525,10 @@ def _less_at_the_tip(
 
 
 def _drawn(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int) -> _Found:
-    """Draws about the fits x with covariances C."""
+    """Draws about the fits x with covariances C, which hold other fits as well where there are such."""
+    if elsewhere(problem) is not None:
+        evaluate = evaluator(problem, nu)
+        C, _ = evaluate.posterior(evaluate.sums(x), x)
     target = _Target(problem, x, C, nu)
     return _importance(target, _about(target, C, draws), draws)
 
@@ -582,7 +546,7 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
         return found
     fit, of = others
     turn = torch.arange(len(of)) - torch.searchsorted(of, of)  # 0 for the cheapest of each sample
-    runs, centres = [found], [to.marks(problem, x)]
+    runs, centres = [found], [marks(problem, x)]
     for k in range(min(MOST_OTHERS, int(turn.max()) + 1)):
         rows = of[turn == k]
         own = fit.of((turn == k).nonzero().squeeze(-1), problem.size)
@@ -590,11 +554,11 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
         run.log_weight[:], run.log_evidence[:] = -math.inf, -math.inf  # of samples without another fit
         run.put(rows, _drawn(problem.take(rows), own.x, own.covariance, nu, draws))
         runs.append(run)
-        centres.append(torch.full_like(centres[0], torch.inf).index_copy(0, rows, to.marks(problem, own.x)))
+        centres.append(torch.full_like(centres[0], torch.inf).index_copy(0, rows, marks(problem, own.x)))
     evidence = torch.stack([run.log_evidence.nan_to_num(-math.inf) for run in runs], 1)
     log_weight = torch.cat([run.log_weight for run in runs], 1).unflatten(1, (len(runs), draws))
     many = torch.stack([run.x for run in runs], 1)
-    away = (to.marks(problem, many).unsqueeze(3) - torch.stack(centres, 1)[:, None, None]).norm(dim=-1).nan_to_num(torch.inf)
+    away = (marks(problem, many).unsqueeze(3) - torch.stack(centres, 1)[:, None, None]).norm(dim=-1).nan_to_num(torch.inf)
     at_home = away.argmin(-1) == torch.arange(len(runs)).unsqueeze(-1)
     share = torch.where(at_home, log_weight.exp(), 0.0).sum(-1)
     total = torch.where(torch.isfinite(evidence).sum(1) > 1, (evidence + share.log()).logsumexp(1), evidence[:, 0])
@@ -639,7 +603,7 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
             if not len(rows):
                 continue
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
-            drawn = _drawn if elsewhere(part) is None else _about_all_fits
+            drawn = _drawn if elsewhere(part) is None or line_of(part) is not None else _about_all_fits
             found = drawn(part, estimate.x[rows], estimate.covariance[rows], nu, draws)
             x[rows], weight[rows] = found.x, found.log_weight.exp()
             loads = len(Chart(part, found.x[:, 0], None).places)

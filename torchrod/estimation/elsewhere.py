@@ -27,7 +27,7 @@ from ..model.problem import Problem
 from ..util.precision import DTYPE
 from ..util.status import Status
 from .other_fits import NODES, Fitting, other_fits, shape_at
-from .result import Estimate
+from .result import Estimate, with_covariance
 
 ALIKE = 0.03  # of the length, and in force scales: places and forces that are closer together are those of one fit
 PLACES = (0.2, 0.4, 0.6, 0.8, 0.95)  # of the length
@@ -37,17 +37,13 @@ FLAT = 100.0  # times as stiff to one side as to the other: a strip
 MOST_PUSHES = 2  # on a strip, all of whose signs are tried; of more, none
 
 Starts = Callable[[Problem, Float[Tensor, "B n"]], list[Float[Tensor, "B n"]]]
-Marks = Callable[[Problem, Float[Tensor, "... n"]], Float[Tensor, "... c"]]
 
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """starts: states to begin at, of samples whose fits are x. marks (..., c): by which such fits differ (lengths, force scales).
-    remedy: what would tell one from the other.
-    """
+    """starts: states to begin at, of samples whose fits are x. remedy: what would tell one from the other."""
 
     starts: Starts
-    marks: Marks
     remedy: str
 
 
@@ -60,9 +56,9 @@ def elsewhere(problem: Problem) -> Elsewhere | None:
     if not isinstance(loads, GaussianCoordinates | PointCoordinates) or loads.locations is not None:
         return None
     if tip.size == 3 and loads.count == 1:
-        return Elsewhere(_beside_the_tip, _place_and_tip, "measure the force at the tip, or what pushes")
+        return Elsewhere(_beside_the_tip, "measure the force at the tip, or what pushes")
     if not tip.size and 1 <= loads.count <= MOST_PUSHES and across_strip(problem.robot.rod) is not None:
-        return Elsewhere(_other_signs, _places_and_across, "measure the force under the base")
+        return Elsewhere(_other_signs, "measure the force under the base")
     return None
 
 
@@ -73,7 +69,7 @@ def fits_elsewhere(problem: Problem, x: Float[Tensor, "B n"], fitting: Fitting) 
         return None
 
     def looks(part: Problem, x: Float[Tensor, "N n"]) -> Float[Tensor, "N c 1"]:
-        return to.marks(part, x).unsqueeze(-1)
+        return marks(part, x).unsqueeze(-1)
 
     starts = to.starts(problem, x)
     every, of = torch.cat(starts), torch.arange(len(x)).repeat(len(starts))
@@ -82,14 +78,35 @@ def fits_elsewhere(problem: Problem, x: Float[Tensor, "B n"], fitting: Fitting) 
 
 
 def cheapest(problem: Problem, fit: Estimate, fitting: Fitting) -> Estimate:
-    """The fit of least cost, of every sample that can be fitted: of `fit` and of fits_elsewhere."""
+    """The fit of least cost, of every sample that can be fitted: of `fit` and of fits_elsewhere.
+
+    Its covariance is that of all of them about it, each weighed by Laplace's method,
+
+        (2)  log w = -cost / 2 + log det C_yy / 2 + const
+
+    with the covariance C_yy of everything but the base wrench. Where several are as likely, a spread about one says too little.
+    """
     index = ((fit.status != int(Status.INVALID)) & torch.isfinite(fit.x).all(-1)).nonzero().squeeze(-1)
     others = fits_elsewhere(problem.take(index), fit.x[index], fitting) if len(index) else None
     if others is None:
         return fit
     other, of = others
     first = torch.cat([of.new_ones(1, dtype=torch.bool), of.diff() > 0])  # of each sample the cheapest
-    return fit.improved_by(other.of(first.nonzero().squeeze(-1), problem.size), index[of[first]])
+    best = fit.improved_by(other.of(first.nonzero().squeeze(-1), problem.size), index[of[first]])
+    mine, rows = torch.zeros(problem.batch, dtype=torch.bool), index[of]
+    mine[rows] = fit.status[rows] == int(Status.CONVERGED)
+    mine = mine.nonzero().squeeze(-1)
+    row = torch.cat([rows, mine])
+    x, C, cost = (torch.cat([getattr(other, name), getattr(fit, name)[mine]]) for name in ("x", "covariance", "cost"))
+    m = problem.state.base.at.start
+    log_w = (-0.5 * cost + 0.5 * torch.linalg.slogdet(C[:, :m, :m])[1]).nan_to_num(-torch.inf, -torch.inf, -torch.inf)
+    w = torch.exp(log_w - log_w.new_full((problem.batch,), -torch.inf).scatter_reduce(0, row, log_w, "amax")[row])
+    off = x - best.x[row]
+    about = w[:, None, None] * (C + off.unsqueeze(-1) * off.unsqueeze(-2))
+    total = torch.zeros_like(fit.cost).index_add(0, row, w)[:, None, None]
+    joined = torch.zeros_like(fit.covariance).index_add(0, row, about) / total
+    sound = (total > 0) & torch.isfinite(joined).flatten(1).all(-1)[:, None, None]
+    return with_covariance(problem, best, torch.where(sound, joined, best.covariance))
 
 
 def _pushes(problem: Problem, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "... K 2"], Float[Tensor, "... K"]]:
@@ -103,6 +120,8 @@ def _pushes(problem: Problem, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, 
 def _tip_force(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 3"]:
     """In force scales."""
     tip = problem.state.tip
+    if not tip.size:
+        return x[..., :0]
     return x[..., tip.at.start : tip.at.start + 3] * (tip.unit[:3] / problem.robot.rod.force_scale)
 
 
@@ -127,9 +146,13 @@ def _held(problem: Problem, shape: Shape, start: Float[Tensor, "B n"], x: Float[
     return start
 
 
-def _place_and_tip(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 4"]:
-    """The push's place and the force at the tip."""
-    return torch.cat([_pushes(problem, x)[1], _tip_force(problem, x)], -1)
+def marks(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... c"]:
+    """By what fits differ: the places of the pushes (lengths), the force at the tip and, on a strip, what pushes across it (force
+    scales).
+    """
+    force, place = _pushes(problem, x)
+    across = across_strip(problem.robot.rod)
+    return torch.cat([place, _tip_force(problem, x), *(() if across is None else (force @ across,))], -1)
 
 
 def _beside_the_tip(problem: Problem, x: Float[Tensor, "B n"]) -> list[Float[Tensor, "B n"]]:
@@ -158,14 +181,6 @@ def across_strip(rod: Rod) -> Float[Tensor, " 2"] | None:
     if not float(stiffness[1]) > FLAT * float(stiffness[0]):
         return None
     return torch.stack([-axes[1, 1], axes[0, 1]])  # what bends the rod about an axis pushes normal to it
-
-
-def _places_and_across(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... c"]:
-    """The places of the pushes, and their parts across the strip."""
-    force, place = _pushes(problem, x)
-    n = across_strip(problem.robot.rod)
-    assert n is not None
-    return torch.cat([place, force @ n], -1)
 
 
 def _other_signs(problem: Problem, x: Float[Tensor, "B n"]) -> list[Float[Tensor, "B n"]]:

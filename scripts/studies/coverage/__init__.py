@@ -1,0 +1,1 @@
+"""How often intervals and bands hold the truth."""

@@ -1,0 +1,159 @@
+"""Where the readings leave a curved valley open: along it there are fits, and draws go all along it."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import torchrod as tr
+from tests.robots import T, steel_rod
+from tests.test_edges import L as STRIP
+from tests.test_edges import strip
+from tests.test_tip import compressed
+from torchrod.estimation.chart import BUCKLES, GIVES_WAY, TWISTS, Chart, _log_size
+from torchrod.estimation.elsewhere import cheapest, fits_elsewhere
+from torchrod.estimation.proposal import Mixture, OnGrid, Proposal, Student
+from torchrod.estimation.solve import Settings, solver_of
+from torchrod.estimation.valley import line_of, valley
+
+PLAIN = solver_of(Settings(restarts=(), basins=0))
+
+
+def across(B: int, noise: float = 1e-4, seed: int = 3) -> tuple[tr.Problem, torch.Tensor]:
+    """Pushes across a strip, hardly along its soft side; the force across (B,) N."""
+    robot, g = strip(1e6), torch.Generator().manual_seed(seed)
+    scale = robot.rod.force_scale
+    F = torch.stack([3e-3 * scale * (1 + torch.rand(B, generator=g)), scale * (2 * torch.rand(B, generator=g) - 1)], -1)
+    s, at = torch.linspace(STRIP / 20, STRIP, 20), STRIP * (0.3 + 0.5 * torch.rand(B, 1, generator=g))
+    p = tr.solve_shape(robot, (tr.PointForces(torch.nn.functional.pad(F, (0, 1)).unsqueeze(1), at),), None, s, B, 160).p
+    p = p + noise * STRIP * torch.randn(p.shape, generator=g)
+    unknowns = tr.Unknowns(tr.GaussianCoordinates(1, STRIP, scale))
+    return tr.Problem(robot, unknowns, [tr.Markers(s, p, noise * STRIP)]), F[:, 1]
+
+
+@pytest.mark.parametrize("kind", ["tip", "strip"])
+def test_fits_along_a_valley_are_held_at_its_knots_and_explain_the_readings(kind):
+    problem = compressed(4, 0.1, 0.55, 5)[0] if kind == "tip" else across(4)[0]
+    line, fit = line_of(problem), tr.estimate(problem)
+    assert line is not None
+    found = valley(problem, fit.x, fit.covariance, PLAIN)
+    assert torch.equal(found.x[:, 0], fit.x) and bool(found.sound[:, 0].all())
+    assert int(found.sound.sum(-1).min()) > 6
+    chi2 = problem.take(torch.arange(4).repeat_interleave(found.sound.shape[1]))
+    off = chi2.reading - chi2.h(found.x.flatten(0, 1), differentiable=False)
+    least = (chi2.weights * off.nan_to_num(0.0) ** 2)[:, :-6].sum(-1).unflatten(0, found.sound.shape)
+    assert bool((least < least[:, :1] + 60.0)[found.sound].all())
+    at = found.x[..., line.entry]
+    near = (at.unsqueeze(-1) - line.knots).abs().amin(-1)
+    assert float((near < 5e-3)[found.sound].double().mean()) > 0.8  # all but the fit and those from elsewhere
+
+
+@pytest.mark.parametrize("kind", ["tip", "strip"])
+def test_draws_along_a_valley_are_of_their_sample_alone(kind):
+    problem = compressed(3, 0.1, 1.2, 2)[0] if kind == "tip" else across(3)[0]
+    fit, index = tr.estimate(problem), torch.tensor([1])
+    draws = tr.posterior_draws(problem, fit, 128)
+    alone = tr.posterior_draws(problem.take(index), fit.of(index, problem.size), 128)
+    counts = alone.weight[0] > 1e-6  # where Newton's steps go astray, it is a matter of round-off where to
+    assert torch.allclose(alone.x[0][counts], draws.x[1][counts], rtol=1e-5, atol=1e-5)
+    assert torch.allclose(alone.weight[0], draws.weight[1], atol=1e-5)
+    assert torch.allclose(alone.log_evidence[0], draws.log_evidence[1], atol=1e-5)
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("kind", ["tip", "strip"])
+def test_a_few_draws_find_what_many_find(kind):
+    """The evidence of 512 and of 4096: one fit's neighbourhood once had a third of what there is, or none of the truth's."""
+    problem = compressed(10, 0.1, 0.55, 5)[0] if kind == "tip" else across(24)[0]
+    fit = tr.estimate(problem)
+    few, many = (tr.posterior_draws(problem, fit, n) for n in (512, 4096))
+    off = (few.log_evidence - many.log_evidence).abs()
+    assert float(off.median()) < 0.25 and float(off.quantile(0.8)) < 0.8
+    assert float((few.k_hat > 0.7).double().mean()) < 0.15
+
+
+def test_no_valley_where_there_is_none():
+    robot, s = steel_rod(), torch.linspace(0.02, 0.4, 20)
+    markers = [tr.Markers(s, torch.zeros(1, 20, 3), 1e-3)]
+
+    def known(count: int, tip: str = "none", at: tuple[float, ...] | None = None, robot: tr.Robot = robot) -> bool:
+        loads = tr.GaussianCoordinates(count, robot.rod.length, robot.rod.force_scale, locations=at)
+        return line_of(tr.Problem(robot, tr.Unknowns(loads, tip), markers)) is not None
+
+    assert known(1, "force") and known(2, "force")
+    assert not known(0, "force") and not known(1) and not known(1, "wrench") and not known(1, "force", (0.2,))
+    flat = strip(1e6)
+    c, n = math.cos(0.3), math.sin(0.3)
+    Q = T([[c, -n, 0.0], [n, c, 0.0], [0.0, 0.0, 1.0]])
+    turned = replace(flat, rod=replace(flat.rod, K_bt=Q @ flat.rod.K_bt @ Q.mT))
+    assert known(1, robot=flat) and not known(2, robot=flat) and not known(1, robot=turned) and not known(1, robot=strip(50.0))
+
+
+def test_the_spread_of_a_push_across_a_strip_is_of_both_signs():
+    """Of all fits about the reported one, by their evidence; z of the force across was 2.4."""
+    problem, force = across(60)
+    fit = tr.estimate(problem)
+    z = (fit.force[:, 0, 1] - force) / fit.load_covariance[:, 0, 1, 1].sqrt()
+    assert float(z.square().mean().sqrt()) < 1.35
+    one = PLAIN(problem, tr.Start.at(fit.x, tr.Origin.OTHER_FIT))
+    others = fits_elsewhere(problem, one.x, PLAIN)
+    assert others is not None
+    other, of = others
+    b = int(of[0])
+    mine = (of == b).nonzero().squeeze(-1)
+    both = cheapest(problem, one, PLAIN)
+    m = problem.state.base.at.start
+    x, C, cost = (torch.cat([getattr(one, name)[b : b + 1], getattr(other, name)[mine]]) for name in ("x", "covariance", "cost"))
+    w = torch.softmax(0.5 * (torch.logdet(C[:, :m, :m]) - cost), 0)
+    off = x - both.x[b]
+    expected = (w[:, None, None] * (C + off.unsqueeze(-1) * off.unsqueeze(-2))).sum(0)
+    assert torch.allclose(both.covariance[b], expected, rtol=1e-6, atol=1e-12 * float(expected.abs().max()))
+    assert torch.allclose(both.load_covariance[b, 0, 1, 1], expected[1, 1] * problem.robot.rod.force_scale**2, rtol=1e-6)
+
+
+def proposals() -> list[Proposal]:
+    """Of two samples, in four coordinates, the third of which is a place."""
+    g = torch.Generator().manual_seed(0)
+
+    def student(m: int) -> Student:
+        A = torch.randn(2, m, m, generator=g, dtype=torch.float64)
+        return Student.of(0.3 * torch.randn(2, m, generator=g, dtype=torch.float64), A @ A.mT / m + 0.3 * torch.eye(m))
+
+    share = torch.rand(2, 3, generator=g, dtype=torch.float64)
+    cells = torch.rand(2, 8, generator=g, dtype=torch.float64)
+    grid = OnGrid(student(3), torch.tensor([[2], [2]]), torch.tensor([0, 1, 3]), 8, cells / cells.sum(-1, keepdim=True))
+    return [student(4), grid, Mixture([student(4) for _ in range(3)], share / share.sum(-1, keepdim=True))]
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_the_density_of_a_proposal_is_that_of_its_draws(which):
+    """The mean of p / q over draws of q is one, q wider than p; and the draws' mean of a function is its integral by others."""
+    p = proposals()[which]
+    wide = Student.of(torch.zeros(2, 4), 6.0 * torch.eye(4).expand(2, 4, 4))
+    v = wide.draw(2**15, 3)
+    weight = (p.log_density(v) - wide.log_density(v)).exp()
+    assert torch.allclose(weight.mean(-1), torch.ones(2), atol=0.05)
+    u, w = torch.sigmoid(p.draw(2**13, 5)), torch.sigmoid(v)  # moments of pairs, too: the first two were once one number
+    assert torch.allclose(u.mean(1), (weight.unsqueeze(-1) * w).mean(1), atol=0.02)
+    assert torch.allclose(u.mT @ u / 2**13, (weight.unsqueeze(-1) * w).mT @ w / 2**15, atol=0.015)
+    assert torch.equal(p.take(torch.tensor([1])).draw(64, 7)[0], p.draw(64, 7)[1])
+
+
+@pytest.mark.parametrize("faint", [1e-5, 0.01, BUCKLES, GIVES_WAY, TWISTS])
+def test_the_prior_of_a_size_is_a_density(faint):
+    F = torch.cat([-torch.logspace(2, -9, 4000), torch.logspace(-9, 2, 4000)])
+    p = _log_size(F.unsqueeze(-1), 10.0, faint).exp()
+    assert abs(float(torch.trapezoid(p, F)) - 1) < 1e-3
+
+
+def test_the_prior_of_a_push_across_a_strip_does_not_know_the_soft_side():
+    """It is even up to what makes the strip give way; one size for both sides took what is across to be as little as the other."""
+    problem, _ = across(1)
+    fit = tr.estimate(problem)
+    chart = Chart.at(problem, fit.x)
+    y = fit.x[:, None, : chart.size].expand(1, 4, -1).clone()
+    y[0, :, :2] = T([[1e-3, 0.1], [1e-3, 0.5], [1e-2, 0.1], [1e-2, 0.5]])
+    p = chart.log_prior(y)[0]
+    assert abs(float(p[1] - p[0])) < 0.15
+    assert abs(float((p[3] - p[2]) - (p[1] - p[0]))) < 1e-9
