@@ -2,7 +2,6 @@
 
 import json
 import math
-from argparse import Namespace
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -11,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jsonargparse import Namespace
 
 from tests.problems import posed, slopes, unknowns_of
 from tests.robots import T, busy_robot, steel_rod

@@ -84,6 +84,21 @@ class _Sized:
         return F if self.axis is None else F.unflatten(-1, (-1, 2)) @ self.axis
 
 
+def log_even(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"] | None:
+    """log of the prior that is even in the forces of pushes, which is the fit's own, over (2), at draws x but for a constant.
+
+    None unless there are two pushes of any size or more. Where two nearly cancel, the readings tell the couple they make, and (2)
+    takes small forces far apart to be likelier than large ones side by side: the fourth power of their distance.
+    """
+    loads = problem.unknowns.loads
+    if problem.prior is not None or not isinstance(loads, GaussianCoordinates | PointCoordinates) or loads.count < 2:
+        return None
+    if loads.force_std != WEAK_STD or loads.locations is not None:
+        return None
+    F = x[..., [loads.per_load * k + i for k in range(loads.count) for i in range(2)]]
+    return -0.5 * F.square().sum(-1) / WEAK_STD**2 - _log_size(F, WEAK_STD, FAINT * min(1.0, *problem.robot.rod.sides))
+
+
 @cache
 def _cubic() -> Float[Tensor, "C J"]:
     """The response at the CELLS + 1 places 0 .. L, from those at PLACES of them, by the cubic through the nearest four; nothing at

@@ -12,9 +12,11 @@ from ..model.load_families import GaussianCoordinates, PaperCoordinates, PointCo
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
+from .chart import log_even
 from .draws import DRAWS, Draws, Method, picked, posterior_draws, systematic
 from .load_profile import DRAWS as OF_BAND
 from .load_profile import LEVELS, NODES, band_of_draws
+from .pareto import smoothed
 from .result import Z95, Estimate
 
 FLAT = 0.3  # times EI: how stiff the soft side of a flat rod is at most
@@ -90,7 +92,28 @@ def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D
 
 
 def intervals(draws: Draws) -> Intervals:
-    """The intervals of draws."""
+    """The intervals of draws; those of force and place of several pushes hold what an even prior of the forces has as well.
+
+    Which of two priors of ignorance is meant, even in the logarithm of the forces' size or in the forces, nobody has said, and of
+    pushes that nearly cancel it decides how large they are and how far apart (estimation.chart, log_even).
+    """
+    made, even = _of_weight(draws), log_even(draws.problem, draws.x)
+    if even is None:
+        return made
+    log_weight, _ = smoothed((draws.weight.log() + even).nan_to_num(-1e9, neginf=-1e9))
+    other = _of_weight(replace(draws, weight=log_weight.exp()))
+    return replace(
+        made, **{name: _either(getattr(made, name), getattr(other, name)) for name in ("magnitude", "location", "force")}
+    )
+
+
+def _either(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+    """The least interval that holds both."""
+    return torch.stack([a[..., 0].minimum(b[..., 0]), a[..., 1].maximum(b[..., 1])], -1)
+
+
+def _of_weight(draws: Draws) -> Intervals:
+    """By the weights that the draws have."""
     problem, x, weight = draws.problem, draws.x, draws.weight
     family, state = problem.unknowns.loads, problem.state
     gamma = x[..., state.loads.at]
@@ -195,7 +218,7 @@ def _hull(drawn: Intervals, fit: Estimate) -> Intervals:
     def joined(own: Tensor | None, normal: Tensor | None) -> Tensor | None:
         if own is None or normal is None:
             return own
-        both = torch.stack([own[..., 0].minimum(normal[..., 0]), own[..., 1].maximum(normal[..., 1])], -1)
+        both = _either(own, normal)
         return torch.where(doubtful.reshape(-1, *[1] * (own.ndim - 1)) & torch.isfinite(both), both, own)
 
     def about(value: Tensor | None, std: Tensor | None) -> Tensor | None:
