@@ -64,10 +64,10 @@ def test_draws_along_a_valley_are_of_their_sample_alone(kind):
 @pytest.mark.study
 @pytest.mark.parametrize("kind", ["tip", "strip"])
 def test_a_few_draws_find_what_many_find(kind):
-    """The evidence of 512 and of 4096: one fit's neighbourhood once had a third of what there is, or none of the truth's."""
-    problem = compressed(6, 0.1, 0.55, 5)[0] if kind == "tip" else across(12)[0]
+    """The evidence of 512 and of 2048: one fit's neighbourhood once had a third of what there is, or none of the truth's."""
+    problem = compressed(10, 0.1, 0.55, 5)[0] if kind == "tip" else across(12)[0]
     fit = tr.estimate(problem)
-    few, many = (tr.posterior_draws(problem, fit, n) for n in (512, 4096))
+    few, many = (tr.posterior_draws(problem, fit, n) for n in (512, 2048))
     off = (few.log_evidence - many.log_evidence).abs()
     assert float(off.median()) < 0.25 and float(off.quantile(0.8)) < 0.8
     assert float((few.k_hat > 0.7).double().mean()) < 0.15
