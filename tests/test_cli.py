@@ -447,3 +447,16 @@ def test_a_table_of_loads_is_not_drawn(tmp_path, capsys):
     names = [str(tmp_path / name) for name in ("robot.toml", "shapes.csv", "loads.csv", "f.png")]
     assert main(["plot", *names[:3], "--out", names[3]]) == 2
     assert "a table of loads lacks what a figure needs; write RESULT.json by estimate --out" in capsys.readouterr().err
+
+
+def test_what_an_unknown_wrench_at_the_tip_hides_is_said(tmp_path, capsys):
+    """Where a push is told beside it, and not beside a force, nor where nothing pushes."""
+    shapes = "s,x,y,z\n" + "".join(f"{s:.2f},{0.3 * s * s},0,{s - 0.06 * s**3}\n" for s in (0.05 * i for i in range(1, 9)))
+    for options, said in (
+        (("--unknown-tip", "wrench"), True),
+        (("--unknown-tip", "force"), False),
+        (("--unknown-tip", "wrench", "--contacts", "0"), False),
+        (("--unknown-tip", "wrench", "--location", "0.2"), False),
+    ):
+        run(tmp_path, ROD, shapes, *options)
+        assert ("hides much of it" in capsys.readouterr().out) == said, options
