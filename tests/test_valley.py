@@ -140,6 +140,55 @@ def test_the_density_of_a_proposal_is_that_of_its_draws(which):
     assert torch.equal(p.take(torch.tensor([1])).draw(64, 7)[0], p.draw(64, 7)[1])
 
 
+@pytest.mark.parametrize("robot", [steel_rod(), strip(1e6)])
+@pytest.mark.parametrize("friction", [None, math.inf])
+def test_an_even_prior_in_place_of_the_other_is_that_of_the_fit(robot, friction):
+    """Of two pushes, whatever shares a size; places, widths and the tip keep theirs."""
+    L = robot.rod.length
+    s = torch.linspace(L / 20, L, 20)
+    loads = tr.GaussianCoordinates(2, L, robot.rod.force_scale, friction=friction)
+    problem = tr.Problem(robot, tr.Unknowns(loads), [tr.Markers(s, torch.nn.functional.pad(s.view(1, -1, 1), (2, 0)), 1e-3 * L)])
+    y = torch.randn(1, 9, problem.state.base.at.start, generator=torch.Generator().manual_seed(0))
+    chart = Chart(problem, torch.nn.functional.pad(y[:, 0], (0, 6)), None)
+    y[..., chart.places] = 0.0
+    even = chart.log_even(y)
+    assert even is not None
+    normal = -0.5 * (problem.precision[: y.shape[-1]] * (y - problem.mean[: y.shape[-1]]) ** 2).sum(-1)
+    off = chart.log_prior(y) + even - normal
+    assert torch.allclose(off, off[:, :1].expand_as(off), atol=1e-9)
+
+
+def test_fits_along_a_valley_have_their_loads_in_the_order_of_the_reported_ones():
+    """Draws in another order are none: they are the same explanation twice."""
+    problem = compressed(3, 0.1, 0.55, 5)[0]
+    loads = tr.GaussianCoordinates(2, 0.4, problem.robot.rod.force_scale, "point")
+    problem = problem.of(tr.Unknowns(loads, "force"))
+    fit = tr.estimate(problem)
+    found = valley(problem, fit.x, fit.covariance, PLAIN)
+    first, second = found.x[..., 2], found.x[..., 2 + loads.per_load]
+    assert bool((((second - first) * (fit.x[:, 2 + loads.per_load] - fit.x[:, 2]).unsqueeze(-1)) >= 0)[found.sound].all())
+    assert torch.allclose(found.C, found.C.mT, atol=1e-9 * float(found.C.abs().max()))
+
+
+def test_the_units_of_the_unknowns_do_not_move_the_valley():
+    """Once F was held to 1e-3 N, which is nothing on one robot and all of it on another."""
+    problem = compressed(4, 0.1, 0.55, 5)[0]
+    plain = problem.of(replace(problem.unknowns, scaled=False))
+    widths = []
+    for own in (problem, plain):
+        fit, line = tr.estimate(own), line_of(own)
+        assert line is not None
+        found = valley(own, fit.x, fit.covariance, PLAIN)
+        scales = found.x[..., line.entry] / line.unit
+        off = (scales.unsqueeze(-1) - line.knots / line.unit).abs().amin(-1)
+        assert float((off < 5e-3)[found.sound].double().mean()) > 0.8
+        drawn = tr.sampled_intervals(own, fit).tip
+        assert drawn is not None
+        widths.append(drawn[..., 1] - drawn[..., 0])
+    ratio = (widths[1] / widths[0])[:, :3]
+    assert float(ratio.log().abs().median()) < 0.3
+
+
 @pytest.mark.parametrize("faint", [1e-5, 0.01, BUCKLES, GIVES_WAY, TWISTS])
 def test_the_prior_of_a_size_is_a_density(faint):
     F = torch.cat([-torch.logspace(2, -9, 4000), torch.logspace(-9, 2, 4000)])

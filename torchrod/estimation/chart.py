@@ -69,34 +69,25 @@ def _log_size(F: Float[Tensor, "... d"], weak: float, faint: float) -> Float[Ten
 
 @dataclass(frozen=True)
 class _Sized:
-    """Entries that share a size by (2): with the deviation of their weak prior, and what is faint. axis: of lateral forces, only
-    what is along it in the section.
+    """Entries that share a size by (2): with the deviation of their weak prior, and what is faint, in force or moment scales. axis:
+    of lateral forces, only what is along it in the section. unit: of the entries, in scales.
     """
 
     at: list[int]
     weak: float
     faint: float
     axis: Float[Tensor, " 2"] | None = None
+    unit: float = 1.0
 
     def of(self, y: Float[Tensor, "... m"]) -> Float[Tensor, "... d"]:
-        """What has that size."""
-        F = y[..., self.at]
+        """What has that size, in scales."""
+        F = self.unit * y[..., self.at]
         return F if self.axis is None else F.unflatten(-1, (-1, 2)) @ self.axis
 
-
-def log_even(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"] | None:
-    """log of the prior that is even in the forces of pushes, which is the fit's own, over (2), at draws x but for a constant.
-
-    None unless there are two pushes of any size or more. Where two nearly cancel, the readings tell the couple they make, and (2)
-    takes small forces far apart to be likelier than large ones side by side: the fourth power of their distance.
-    """
-    loads = problem.unknowns.loads
-    if problem.prior is not None or not isinstance(loads, GaussianCoordinates | PointCoordinates) or loads.count < 2:
-        return None
-    if loads.force_std != WEAK_STD or loads.locations is not None:
-        return None
-    F = x[..., [loads.per_load * k + i for k in range(loads.count) for i in range(2)]]
-    return -0.5 * F.square().sum(-1) / WEAK_STD**2 - _log_size(F, WEAK_STD, FAINT * min(1.0, *problem.robot.rod.sides))
+    def log_prior(self, y: Float[Tensor, "... m"]) -> Float[Tensor, "..."]:
+        """(2) of the entries."""
+        F = self.of(y)
+        return _log_size(F, self.weak, self.faint) + F.shape[-1] * math.log(self.unit)
 
 
 @cache
@@ -369,11 +360,27 @@ class Chart:
             else:
                 soft = torch.stack([across[1], -across[0]])
                 found += [_Sized(lateral, WEAK_STD, FAINT * min(sides), soft), _Sized(lateral, WEAK_STD, GIVES_WAY, across)]
-        tip = self.problem.state.tip.at
-        for first in range(tip.start, tip.stop, 3):  # across the base's axis, and along it
-            along = (TORQUE_STD, TWISTS) if first > tip.start else (TIP_STD, BUCKLES)
-            found += [_Sized([first, first + 1], TIP_STD, FAINT), _Sized([first + 2], *along)]
+        tip, rod = self.problem.state.tip, self.problem.robot.rod
+        for first in range(tip.at.start, tip.at.stop, 3):  # across the base's axis, and along it
+            turns = first > tip.at.start
+            along = (TORQUE_STD, TWISTS) if turns else (TIP_STD, BUCKLES)
+            unit = float(tip.unit[first - tip.at.start]) / (rod.moment_scale if turns else rod.force_scale)
+            found += [_Sized([first, first + 1], TIP_STD, FAINT, unit=unit), _Sized([first + 2], *along, unit=unit)]
         return found
+
+    def log_even(self, y: Float[Tensor, "B D m"]) -> Float[Tensor, "B D"] | None:
+        """log of the prior that is even in the forces of pushes, which is the fit's own, over (2), but for a constant.
+
+        None unless there are two pushes of any size or more. Where two nearly cancel, the readings tell the couple they make, and
+        (2) takes small forces far apart to be likelier than large ones side by side: the fourth power of their distance.
+        """
+        loads = self.problem.state.loads.at
+        pushes = [sized for sized in self._scale_free if sized.at[0] < loads.stop]
+        if len(self.places) < 2 or not pushes:
+            return None
+        even = sum(-0.5 * sized.of(y).square().sum(-1) / sized.weak**2 - sized.log_prior(y) for sized in pushes)
+        assert isinstance(even, Tensor)
+        return even
 
     def fitted_prior(self, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"]:
         """What the fit's cost holds of its own prior."""
@@ -386,7 +393,7 @@ class Chart:
         mean, precision = ((v.unsqueeze(1) if v.ndim > 1 else v)[..., :m] for v in (self.problem.mean, self.problem.precision))
         normal = torch.ones(m, dtype=torch.bool)
         for sized in self._scale_free:
-            total = total + _log_size(sized.of(y), sized.weak, sized.faint)
+            total = total + sized.log_prior(y)
             normal[sized.at] = False
         for i in self.places if self.problem.prior is None else ():
             total = total + torch.nn.functional.logsigmoid(y[..., i]) + torch.nn.functional.logsigmoid(-y[..., i])

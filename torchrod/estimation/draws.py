@@ -40,6 +40,7 @@ from .valley import line_of, valley
 
 DRAWS = 512  # a power of two
 ROWS = 32768  # draws evaluated at a time
+AT_ONCE = 64  # samples with a valley, each of whose fits is compared with all others
 PLAIN = Settings(restarts=(), basins=0, sized=False)
 WIDEST = 2.5  # of eta: a place that may be anywhere has 1.8
 STRAIGHT = 0.5  # of eta: what goes with a place less sure than that, to first order, goes astray
@@ -483,7 +484,7 @@ def _with_valley(target: _Target, first: list[tuple[Proposal, int]]) -> list[tup
     even = valley.sound / valley.sound.sum(-1, keepdim=True)
     share = (1 - ANYWHERE) * torch.softmax(log_share, -1).nan_to_num(0.0) + ANYWHERE * even
     half = [(p, k // 2) for p, k in first]
-    return [*half, (Mixture(parts, share), sum(k for _, k in first) - sum(k for _, k in half))]
+    return [*half, (Mixture(parts, share / share.sum(-1, keepdim=True)), sum(k for _, k in first) - sum(k for _, k in half))]
 
 
 def _no_wider(chart: Chart, C: Float[Tensor, "b m m"]) -> Float[Tensor, "b m m"]:
@@ -528,7 +529,8 @@ def _drawn(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"],
     """Draws about the fits x with covariances C, which hold other fits as well where there are such."""
     if elsewhere(problem) is not None:
         evaluate = evaluator(problem, nu)
-        C, _ = evaluate.posterior(evaluate.sums(x), x)
+        own, _ = evaluate.posterior(evaluate.sums(x), x)
+        C = torch.where(torch.isfinite(own).flatten(1).all(-1)[:, None, None], own, C)
     target = _Target(problem, x, C, nu)
     return _importance(target, _about(target, C, draws), draws)
 
@@ -599,7 +601,8 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
         x, weight = estimate.x.unsqueeze(1).expand(B, draws, n), (known / draws).unsqueeze(-1).expand(B, draws)
         return Draws(problem, x, weight, 0 * known, draws * known, -0.5 * estimate.cost * known, fine * int(Method.IMPORTANCE))
     with torch.inference_mode(False), one_thread():
-        for rows in fine.nonzero().squeeze(-1).split(max(1, ROWS // draws)):
+        most = ROWS // draws if line_of(problem) is None else min(ROWS // draws, AT_ONCE)
+        for rows in fine.nonzero().squeeze(-1).split(max(1, most)):
             if not len(rows):
                 continue
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)

@@ -12,7 +12,7 @@ from ..model.load_families import GaussianCoordinates, PaperCoordinates, PointCo
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
-from .chart import log_even
+from .chart import Chart
 from .draws import DRAWS, Draws, Method, picked, posterior_draws, systematic
 from .load_profile import DRAWS as OF_BAND
 from .load_profile import LEVELS, NODES, band_of_draws
@@ -95,12 +95,14 @@ def intervals(draws: Draws) -> Intervals:
     """The intervals of draws; those of force and place of several pushes hold what an even prior of the forces has as well.
 
     Which of two priors of ignorance is meant, even in the logarithm of the forces' size or in the forces, nobody has said, and of
-    pushes that nearly cancel it decides how large they are and how far apart (estimation.chart, log_even).
+    pushes that nearly cancel it decides how large they are and how far apart (Chart.log_even).
     """
-    made, even = _of_weight(draws), log_even(draws.problem, draws.x)
+    chart = Chart(draws.problem, draws.x[:, 0], None)
+    made, even = _of_weight(draws), chart.log_even(draws.x[..., : chart.size])
     if even is None:
         return made
     log_weight, _ = smoothed((draws.weight.log() + even).nan_to_num(-1e9, neginf=-1e9))
+    # Where the two priors contradict each other it has few draws. They explain the readings, and so are within what is held.
     other = _of_weight(replace(draws, weight=log_weight.exp()))
     return replace(
         made, **{name: _either(getattr(made, name), getattr(other, name)) for name in ("magnitude", "location", "force")}

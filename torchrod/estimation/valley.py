@@ -162,23 +162,25 @@ class _Search:
         mean, precision = (v.expand(len(of), -1).clone() for v in (part.mean, part.precision))
         for i in range(0, part.state.loads.size, self.per_load):
             precision[:, i : i + 2], precision[:, i + 2], mean[:, i + 2] = PUSH**-2, PLACE**-2, 0.0
-        mean[:, line.entry], precision[:, line.entry] = knots[knot], HELD**-2
+        mean[:, line.entry], precision[:, line.entry] = knots[knot], (HELD * line.unit) ** -2
         precision[:, line.tip] = (across * line.unit) ** -2
         fit = self.fitting(replace(part, prior=(mean, precision)), Start.at(start, Origin.ELSEWHERE))
         gap = torch.maximum(knots.diff()[(knot - 1).clamp(min=0)], knots.diff()[knot.clamp(max=len(knots) - 2)])
         slope = self._slope(fit)
         C = fit.covariance + slope.unsqueeze(-1) * slope.unsqueeze(-2) * (OVERLAP * gap).square()[:, None, None]
-        cost = fit.cost - ((precision - self.problem.precision) * (fit.x - mean) ** 2).sum(-1)
+        weak = self.problem.precision * (fit.x - self.problem.mean) ** 2
+        cost = fit.cost - (precision * (fit.x - mean) ** 2 - weak).sum(-1)
         away = (marks(self.problem, fit.x).unsqueeze(1) - marks(self.problem, self.x)).norm(dim=-1)
         known = ((away < ALIKE) & (self.of == of.unsqueeze(-1)) & (self.knot == knot.unsqueeze(-1))).any(-1)
-        kept = (fit.status == int(Status.CONVERGED)) & ~known & (cost < self.least()[of] + WORSE)
+        sound = (fit.status == int(Status.CONVERGED)) & torch.isfinite(C).flatten(1).all(-1)
+        kept = sound & ~known & (cost < self.least()[of] + WORSE)
         self.add(of[kept], knot[kept], fit.x[kept], C[kept], cost[kept])
         return fit, kept
 
     def _slope(self, fit: Estimate) -> Float[Tensor, "r n"]:
         """dx/dF of (1)."""
         C = fit.covariance
-        return C[:, :, self.line.entry] / C[:, self.line.entry, self.line.entry].clamp(min=1e-14).unsqueeze(-1)
+        return C[:, :, self.line.entry] / C[:, self.line.entry, self.line.entry].clamp(min=1e-14 * self.line.unit**2).unsqueeze(-1)
 
     def joined(self, x: Float[Tensor, "B n"], C: Float[Tensor, "B n n"]) -> Valley:
         """By sample, after the fits x."""
@@ -186,9 +188,22 @@ class _Search:
         kept = kept[self.of[kept].argsort(stable=True)]
         of = self.of[kept]
         place = 1 + torch.arange(len(of)) - torch.searchsorted(of, of)
+        own, own_C = self._ordered(self.x[kept], self.C[kept], x[of])
         one, S = Valley.of(x, C), 1 + int(torch.bincount(of, minlength=1).max())
         found = Valley(*(v.expand(-1, S, *v.shape[2:]).clone() for v in (one.x, one.C, one.sound)))
-        found.x[of, place], found.C[of, place] = self.x[kept], self.C[kept]
+        found.x[of, place], found.C[of, place] = own, own_C
         found.sound[:, 1:] = False
         found.sound[of, place] = True
         return found
+
+    def _ordered(
+        self, x: Float[Tensor, "r n"], C: Float[Tensor, "r n n"], like: Float[Tensor, "r n"]
+    ) -> tuple[Float[Tensor, "r n"], Float[Tensor, "r n n"]]:
+        """With the loads in that order along the rod in which others have them."""
+        loads, n = self.problem.state.loads.size, x.shape[1]
+        theirs, own = (v[:, :loads].unflatten(1, (-1, self.per_load))[..., 2].argsort(dim=1, stable=True) for v in (like, x))
+        block = torch.zeros_like(own).scatter(1, theirs, own)
+        entries = (block.unsqueeze(-1) * self.per_load + torch.arange(self.per_load)).flatten(1)
+        entries = torch.cat([entries, torch.arange(loads, n).expand(len(x), -1)], 1)
+        rows = entries.unsqueeze(-1).expand(-1, -1, n)
+        return x.gather(1, entries), C.gather(1, rows).gather(2, rows.mT)
