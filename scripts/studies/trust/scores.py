@@ -254,8 +254,8 @@ up a part of a load. Where a z-score is off by more than 5 %, and why:
   pushes have. Intervals are too wide there, not too narrow.
 - Widths from the whole prior, 1.05 to 1.11 with the median where it should be: a load four times as wide as a contact is found as a
   narrow one, whose force and place would be better known. With the deviations of a fit that ends at the truth it is 0.94 to 1.03,
-  and the draws, which have every width in them, hold 92 to 96 %.
+  and the draws, which have every width in them, hold 93 to 96 %.
 - A ratio of a million, across: such a strip does not bend to a push across it. What shows is what it does to the other side, which
   is alike for both signs, and alike for a stronger push nearer the base. The deviation of the fit is of both signs, but its
-  distribution is not normal: z of 1.04 to 1.13. The draws go all along what explains the readings, and hold {strips} %.
-- Pushes known to 10 to 30 %, at a noise of a hundredth: the covariance is that of a linear model. The draws hold 93 to 99 %."""
+  distribution is not normal: z of 1.05 to 1.16. The draws go all along what explains the readings, and hold 94 to 97 %.
+- Pushes known to 10 to 30 %, at a noise of a hundredth: the covariance is that of a linear model. The draws hold 94 to 99 %."""
