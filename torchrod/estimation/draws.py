@@ -542,9 +542,8 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
     it does, a fit has its draws twice; the evidence counts of each run what is nearest to its own fit.
     """
     found = _drawn(problem, x, C, nu, draws)
-    to = elsewhere(problem)
     others = fits_elsewhere(problem, x, solver_of(Settings(restarts=(), basins=0, sized=False)))
-    if to is None or others is None:
+    if others is None:
         return found
     fit, of = others
     turn = torch.arange(len(of)) - torch.searchsorted(of, of)  # 0 for the cheapest of each sample

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..model.load_families import GaussianCoordinates, PaperCoordinates, PointCoordinates
+from ..model.load_families.family import LoadReport
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
@@ -97,48 +98,46 @@ def intervals(draws: Draws) -> Intervals:
     Which of two priors of ignorance is meant, even in the logarithm of the forces' size or in the forces, nobody has said, and of
     pushes that nearly cancel it decides how large they are and how far apart (Chart.log_even).
     """
-    chart = Chart(draws.problem, draws.x[:, 0], None)
-    made, even = _of_weight(draws), chart.log_even(draws.x[..., : chart.size])
-    if even is None:
-        return made
-    log_weight, _ = smoothed((draws.weight.log() + even).nan_to_num(-1e9, neginf=-1e9))
-    # Where the two priors contradict each other it has few draws. They explain the readings, and so are within what is held.
-    other = _of_weight(replace(draws, weight=log_weight.exp()))
-    return replace(
-        made, **{name: _either(getattr(made, name), getattr(other, name)) for name in ("magnitude", "location", "force")}
-    )
+    problem, x, weight = draws.problem, draws.x, draws.weight
+    family, state, chart = problem.unknowns.loads, problem.state, Chart(problem, x[:, 0], None)
+    gamma = x[..., state.loads.at]
+    report, R = family.describe(gamma), resultant(problem, x)
+    size, place, force = _of_loads(problem, report, weight)
+    even = chart.log_even(x[..., : chart.size])
+    if even is not None:
+        log_weight, _ = smoothed((weight.log() + even).nan_to_num(-1e9, neginf=-1e9))
+        # Where the two priors contradict each other few draws count here. They explain the readings all the same.
+        other = _of_loads(problem, report, log_weight.exp())
+        size, place, force = (_either(own, more) for own, more in zip((size, place, force), other, strict=True))
+    whole = torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight, _flat(problem))], 1)
+    drag = None if report.axial is None else quantiles(report.axial, weight)
+    tip = quantiles(state.tip_wrench(x), weight) if state.tip.size else None
+    s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
+    band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
+    if not isinstance(family, GaussianCoordinates | PointCoordinates | PaperCoordinates) and place.numel():
+        # The centroid of |f|, and the size of the net force, of draws that are not smooth are not those of their mean.
+        size, place = torch.full_like(size, torch.nan), torch.full_like(place, torch.nan)
+    made = Intervals(size, place, force, drag, whole, tip, band, draws.k_hat, draws.ess, draws.method)
+    return _masked(made, draws.k_hat <= 1)
+
+
+def _of_loads(
+    problem: Problem, report: LoadReport, weight: Float[Tensor, "B D"]
+) -> tuple[Float[Tensor, "B K 2"], Float[Tensor, "B K 2"], Float[Tensor, "B K 2 2"]]:
+    """Of size, place and force of every load, by the weights of the draws."""
+    K = report.location.shape[-1]
+    place, force = quantiles(torch.cat([report.location, report.force.flatten(-2)], -1), weight).split([K, 2 * K], 1)
+    return of_sizes(report.force, weight, _flat(problem)), place, force.unflatten(1, (K, 2))
+
+
+def _flat(problem: Problem) -> bool:
+    """Whether the rod is, for of_sizes."""
+    return min(problem.robot.rod.sides) < FLAT
 
 
 def _either(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
     """The least interval that holds both."""
     return torch.stack([a[..., 0].minimum(b[..., 0]), a[..., 1].maximum(b[..., 1])], -1)
-
-
-def _of_weight(draws: Draws) -> Intervals:
-    """By the weights that the draws have."""
-    problem, x, weight = draws.problem, draws.x, draws.weight
-    family, state = problem.unknowns.loads, problem.state
-    gamma = x[..., state.loads.at]
-    report, R = family.describe(gamma), resultant(problem, x)
-    values = [report.location, report.force.flatten(-2), R]
-    values += [x.new_zeros(*x.shape[:-1], 0) if report.axial is None else report.axial]
-    if state.tip.size:
-        values.append(state.tip_wrench(x))
-    parts = quantiles(torch.cat(values, -1), weight).split([v.shape[-1] for v in values], 1)
-    place, force, whole, axial, tip, K = *parts[:4], parts[-1], report.location.shape[-1]
-    flat = min(problem.robot.rod.sides) < FLAT
-    force = force.unflatten(1, (K, 2))
-    size = of_sizes(report.force, weight, flat)
-    whole = torch.cat([whole, of_sizes(R.unsqueeze(2), weight, flat)], 1)
-    s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
-    band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
-    numbers = draws.k_hat, draws.ess, draws.method
-    drag = None if report.axial is None else axial
-    if not isinstance(family, GaussianCoordinates | PointCoordinates | PaperCoordinates) and K:
-        # The centroid of |f|, and the size of the net force, of draws that are not smooth are not those of their mean.
-        size, place = torch.full_like(size, torch.nan), torch.full_like(place, torch.nan)
-    made = Intervals(size, place, force, drag, whole, tip if state.tip.size else None, band, *numbers)
-    return _masked(made, draws.k_hat <= 1)
 
 
 def _masked(made: Intervals, sound: Tensor) -> Intervals:

@@ -58,8 +58,8 @@ class Valley:
 
 @dataclass(frozen=True)
 class Line:
-    """What is held: an entry of x, at knots (J,) in its units. tip: the entries that are forces across the tip, and the unit in
-    which these are force scales.
+    """What is held: an entry of x, at knots (J,) in its units. tip: the entries that are forces across the tip. unit: a force scale
+    in the units of all these.
     """
 
     entry: int
@@ -72,8 +72,8 @@ def line_of(problem: Problem) -> Line | None:
     """Along what a problem has a valley; None where it has none.
 
     A force that is unknown at the tip beside pushes at unknown places; not beside a moment that is unknown as well, which twists
-    the rod, and lateral forces with it, too far from one fit to the next. And one push on a strip along whose sides the axes
-    are.
+    the rod, and lateral forces with it, too far from one fit to the next. And one push on a strip whose sides lie along the axes of
+    the section.
     """
     loads, state, scale = problem.unknowns.loads, problem.state, problem.robot.rod.force_scale
     if problem.prior is not None or not isinstance(loads, GaussianCoordinates | PointCoordinates) or loads.locations is not None:

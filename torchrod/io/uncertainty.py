@@ -97,8 +97,10 @@ class NearlyKnown:
 
 def check_parameters(uncertainty: Uncertainty | None, robot: Robot, path: str | Path) -> None:
     """Raise InputError, naming the file, where what it states cannot be of its robot."""
+    if uncertainty is None:
+        return
     try:
-        _ = uncertainty is None or uncertainty.parameters(robot)
+        uncertainty.parameters(robot)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
 

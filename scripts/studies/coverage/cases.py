@@ -34,6 +34,11 @@ class Kind:
     unknown: str = "none"
 
 
+def _pressed(least: float, most: float) -> Kind:
+    name = f"push beside {least:g} to {most:g} scales that press the tip, unknown"
+    return Kind(name, 1, 1e-3, (0.2, 0.8), tip="pressed", size=(least, most), unknown="force")
+
+
 TOLD = {
     "one": Kind("one push, 0.25 % noise", 1, 2.5e-3),
     "one-exact": Kind("one push, 0.1 % noise", 1, 1e-3),
@@ -43,24 +48,8 @@ TOLD = {
     "opposed": Kind("two pushes 5 to 10 % apart, opposed", 2, 1e-3, place=(0.3, 1.0), apart=(0.05, 0.1), way="opposed"),
     "three": Kind("three pushes 15 % apart or more", 3, 1e-3, apart=(0.15, 1.0)),
     "moment": Kind("nothing but a moment at the tip, wrench unknown", 0, 1e-3, tip="moment", size=(0.1, 0.5), unknown="wrench"),
-    "pressed": Kind(
-        "push beside 0.1 to 0.55 scales that press the tip, unknown",
-        1,
-        1e-3,
-        (0.2, 0.8),
-        tip="pressed",
-        size=(0.1, 0.55),
-        unknown="force",
-    ),
-    "buckled": Kind(
-        "push beside 0.8 to 1.5 scales that press the tip, unknown",
-        1,
-        1e-3,
-        (0.2, 0.8),
-        tip="pressed",
-        size=(0.8, 1.5),
-        unknown="force",
-    ),
+    "pressed": _pressed(0.1, 0.55),
+    "buckled": _pressed(0.8, 1.5),
     "tip": Kind(
         "push beside a force at the tip, force unknown", 1, 1e-3, (0.3, 1.0), tip="force", size=(0.1, 0.5), unknown="force"
     ),
