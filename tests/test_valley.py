@@ -171,22 +171,23 @@ def test_fits_along_a_valley_have_their_loads_in_the_order_of_the_reported_ones(
 
 
 def test_the_units_of_the_unknowns_do_not_move_the_valley():
-    """Once F was held to 1e-3 N, which is nothing on one robot and all of it on another."""
-    problem = compressed(4, 0.1, 0.55, 5)[0]
-    plain = problem.of(replace(problem.unknowns, scaled=False))
+    """Of a rod a thousand times as soft: once F was held to 1e-3 N, which is a force scale there."""
+    stiff = compressed(4, 0.1, 0.55, 5)[0]
+    rod = stiff.robot.rod
+    soft = replace(stiff.robot, rod=replace(rod, K_bt=1e-3 * rod.K_bt, K_se=1e-3 * rod.K_se))
+    unknowns = tr.Unknowns(tr.GaussianCoordinates(1, rod.length, soft.rod.force_scale, "point"), "force")
     widths = []
-    for own in (problem, plain):
+    for scaled in (True, False):
+        own = tr.Problem(soft, replace(unknowns, scaled=scaled), stiff.sensors)
         fit, line = tr.estimate(own), line_of(own)
-        assert line is not None
+        assert line is not None and math.isclose(line.unit, 1.0 if scaled else soft.rod.force_scale)
         found = valley(own, fit.x, fit.covariance, PLAIN)
-        scales = found.x[..., line.entry] / line.unit
-        off = (scales.unsqueeze(-1) - line.knots / line.unit).abs().amin(-1)
+        off = (found.x[..., line.entry, None] - line.knots).abs().amin(-1) / line.unit
         assert float((off < 5e-3)[found.sound].double().mean()) > 0.8
         drawn = tr.sampled_intervals(own, fit).tip
         assert drawn is not None
-        widths.append(drawn[..., 1] - drawn[..., 0])
-    ratio = (widths[1] / widths[0])[:, :3]
-    assert float(ratio.log().abs().median()) < 0.3
+        widths.append(drawn[:, :3, 1] - drawn[:, :3, 0])
+    assert float((widths[1] / widths[0]).log().abs().median()) < 0.3
 
 
 @pytest.mark.parametrize("faint", [1e-5, 0.01, BUCKLES, GIVES_WAY, TWISTS])

@@ -51,7 +51,7 @@ EXACT = (
 )
 LATERAL = "Contacts are taken to push without drag along the rod; where they rub, state --contact-friction."
 HIDDEN = (
-    "Beside a push an unknown wrench at the tip hides much of it: 95 % intervals hold the truth in 80 to 90 %. Where no moment "
+    "Beside a push an unknown wrench at the tip hides much of it: 95 % intervals hold the truth in 75 to 90 %. Where no moment "
     "acts on the tip, --unknown-tip force tells more."
 )
 NOISE_OF = {"orientations": "orientations qx,qy,qz,qw", "curvature": "curvatures kx,ky", "base_wrench": "base wrenches base_fx, .."}
