@@ -123,7 +123,7 @@ def test_close_explanations_are_told(tmp_path, capsys):
     out = tmp_path / "result.json"
     assert not main(["estimate", *given, "--noise", str(NOISE), "--contacts", "auto", "--load-prior", "auto", "--out", str(out)])
     records = json.loads(out.read_text())["results"]
-    told = [r for r in records if "remain possible" in r["message"]]
+    told = [r for r in records if "remain possible" in r["message"] and "tip force" not in r["message"]]
     assert told and all(0.1 <= sorted(r["evidence"]["probability"].values())[-2] <= 0.5 for r in told)
     for record in records:
         shares = record["evidence"]["probability"]
@@ -131,7 +131,8 @@ def test_close_explanations_are_told(tmp_path, capsys):
         told = {name: share for name, share in shares.items() if "smooth" not in name}
         assert max(told, key=lambda name: told[name]) == record["evidence"]["chosen"]
         assert record["evidence"]["probability_of_any_load"] > 0.99
-        assert record["resultant"]["interval_95"]["magnitude_N"][0] > 0
+        at_tip = any("tip" in name for name in shares)  # its force along the rod may be anything
+        assert record["resultant"]["interval_95"]["magnitude_N"][0] > 0 or at_tip
     assert "remain possible" in capsys.readouterr().out
 
 

@@ -1,9 +1,10 @@
 """What is known whatever the hypothesis: their probabilities, and resultants and bands averaged by them.
 
 The marginal likelihood of a hypothesis is the mean weight of the draws of its posterior (estimation.draws), with priors that are
-normalized. Probabilities p_h, by which loads are reported, are in its proportion, times ONE_MORE for each load; a smooth load is
-reported where no other explains the readings. The resultant, and f(s) along the rod, which all of them have, are of draws of all of
-them, weighted by the marginal likelihood alone: a load that is not reported may be there, and must not be left out of an interval.
+normalized. Probabilities p_h, by which loads are reported, are in its proportion, times ONE_MORE for each load and UNTOLD for a
+force at the tip that nobody told of; a smooth load is reported where no other explains the readings. The resultant, and f(s) along
+the rod, which all of them have, are of draws of all of them, weighted by the marginal likelihood alone: a load that is not reported
+may be there, and must not be left out of an interval.
 Source: Hoeting et al., Statistical Science 14 (1999) 382.
 """
 
@@ -22,7 +23,7 @@ from ..estimation.load_profile import NODES, densities
 from ..estimation.result import Estimate
 from ..model.problem import Problem
 from ..util.precision import DTYPE
-from .count import Bar, Evidence, Hypothesis, Selection, no_bar
+from .count import UNTOLD, Bar, Evidence, Hypothesis, Selection, no_bar
 
 ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
 OF_ANY_FORM = 0.0  # loads that a smooth one counts as: there are more forms of a distributed load than one
@@ -70,8 +71,8 @@ def average(
         (OF_ANY_FORM if h else c.contacts) + (own.state.tip.size > 0)
         for h, c, own in zip(held.tolist(), candidates, problems, strict=True)
     ]
-    rarer = math.log(ONE_MORE) * torch.tensor(more)
-    forms = [_form(c) for c in candidates]
+    rarer = math.log(ONE_MORE) * torch.tensor(more) + math.log(UNTOLD) * torch.tensor([c.spare for c in candidates])
+    kinds = _kinds(candidates)
     fit, choice = found.fit, found.evidence.choice.clone()
     collected = Collected(fit)
     with bar(problem.batch, "draws") as shown:
@@ -88,16 +89,29 @@ def average(
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
                     collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen)))
-            _mix(collected, chunk, drawn, _probabilities(drawn, scores[chunk]), forms)
+            _mix(collected, chunk, drawn, _probabilities(drawn, scores[chunk]), kinds)
             shown.update(len(chunk))
     evidence = replace(found.evidence, choice=choice, probability=probability)
     return Averaged(fit, evidence, collected.whole(fit))
 
 
-def _form(candidate: Hypothesis) -> str:
-    """What kind of load a hypothesis has; "" for none."""
-    loads = candidate.unknowns.loads
-    return getattr(loads, "prior_name", "").partition("(")[0] if loads.size else ""
+@dataclass(frozen=True)
+class _Kind:
+    """Hypotheses (H,) of loads of one kind. whenever: however improbable they are, if they explain a sample."""
+
+    mine: Bool[Tensor, " H"]
+    whenever: bool
+
+
+def _kinds(candidates: Sequence[Hypothesis]) -> list[_Kind]:
+    """Of each form of load, where there are several; and with a force at the tip that nobody told of, and without."""
+    loads = [c.unknowns.loads for c in candidates]
+    form = [getattr(f, "prior_name", "").partition("(")[0] if f.size else "" for f in loads]
+    names = sorted({name for name in form if name})
+    spare = torch.tensor([c.spare for c in candidates])
+    loaded = torch.tensor([c.unknowns.tip != "none" or f.size > 0 for c, f in zip(candidates, loads, strict=True)])
+    found = [_Kind(torch.tensor([own == name for own in form]), name == ANY_FORM) for name in names if names[1:]]
+    return found + [_Kind(mine, True) for mine in (spare, ~spare & loaded) if bool(spare.any())]
 
 
 def _running(scores: Float[Tensor, "B H"], kind: Bool[Tensor, " H"]) -> Bool[Tensor, "B H"]:
@@ -156,25 +170,23 @@ def _mix(
     chunk: Int[Tensor, " c"],
     drawn: list[_Drawn],
     probability: Float[Tensor, "c H"],
-    forms: Sequence[str],
+    kinds: Sequence[_Kind],
 ) -> None:
     """Resultants and bands of draws of all hypotheses, of the samples that have several.
 
-    Of loads of several forms these hold what each form has for itself, where it has a share of POSSIBLE or, any form, explains a
-    sample at all: readings that several forms explain alike say nothing of which it is, while the marginal likelihood takes the one
-    with the fewest numbers.
+    Of loads of several kinds these hold what each kind has for itself, where it has a share of POSSIBLE or, any form and a force at
+    the tip, explains a sample at all: readings that several kinds explain alike say nothing of which it is, while the marginal
+    likelihood takes the one with the fewest numbers. So a pull at the tip passes for two opposed pushes near it, and they for it.
     """
     several = (probability.amax(-1) < 1 - NEGLIGIBLE).nonzero().squeeze(-1)
     _put(collected, chunk, several, _mixed(drawn, probability, several), hull=False)
-    kinds = sorted({form for form in forms if form})
-    for kind in kinds if kinds[1:] else []:
-        mine = torch.tensor([form == kind for form in forms])
-        of_kind = [d for d in drawn if mine[d.h]]
-        possible = torch.where(mine, probability, 0.0).sum(-1) > POSSIBLE
-        for d in of_kind if kind == ANY_FORM else []:
+    for kind in kinds:
+        of_kind, share = [d for d in drawn if kind.mine[d.h]], torch.where(kind.mine, probability, 0.0)
+        possible = share.sum(-1) > POSSIBLE
+        for d in of_kind if kind.whenever else []:
             possible[d.rows] |= d.fit.accepted
-        rows = possible.nonzero().squeeze(-1)
-        _put(collected, chunk, rows, _mixed(of_kind, torch.where(mine, probability, 0.0), rows), hull=True)
+        rows = (possible & (share.sum(-1) > 0)).nonzero().squeeze(-1)
+        _put(collected, chunk, rows, _mixed(of_kind, share, rows), hull=True)
 
 
 def _put(

@@ -24,7 +24,9 @@ from ..util.status import Status
 from .score_test import score_test, start_with_one_more
 
 PROMISING = 0.4  # one more load is tried where the score test promises this much of what BIC asks for: it is linear, so only a hint
-MAX_CONTACTS = 3
+MAX_CONTACTS = 4
+NEAR_TIP = 0.75  # of the length: a force at the tip that also pulls along the rod looks like a contact this far out, or farther
+UNTOLD = 0.05  # how probable a force at the tip is before the data where nobody told of one, times that of a contact
 CLOSE = 0.1  # of the probability: an explanation with more is told
 Parts = list[tuple[Unknowns, Int[Tensor, " b"]]]
 StartFor = Callable[[Problem], StartRule]
@@ -83,15 +85,17 @@ class Evidence:
         if self.probability is None:
             return ""
         shares: dict[str, float] = {}  # smooth loads of all sizes and length scales, which stand in brackets, together
+        evenly: dict[str, float] = {}  # what would be as likely as the others, had somebody told of it
         for name, share in zip(self.names, self.probability[sample].nan_to_num(0.0).tolist(), strict=True):
             kind = name.partition("(")[0]
             shares[kind] = shares.get(kind, 0.0) + share
+            evenly[kind] = evenly.get(kind, 0.0) + share / (UNTOLD if name in self.spare else 1.0)
         chosen = self.names[int(self.choice[sample])].partition("(")[0]
-        rest = {name: share for name, share in shares.items() if name != chosen}
+        rest = {name: share for name, share in evenly.items() if name != chosen}
         best = max(rest, key=lambda name: rest[name], default=chosen)
-        if best == chosen or rest[best] < CLOSE:
+        if best == chosen or rest[best] < CLOSE * sum(evenly.values()):
             return ""
-        both = f"{chosen} ({100 * shares[chosen]:.0f} %) and {best} ({100 * rest[best]:.0f} %)"
+        both = f"{chosen} ({100 * shares[chosen]:.0f} %) and {best} ({100 * shares[best]:.0f} %)"
         return f"Among the numbers and kinds of loads, {both} remain possible."
 
 
@@ -99,7 +103,8 @@ class Evidence:
 class Hypothesis:
     """One explanation of the readings: `contacts` loads among its unknowns; name is what files call it.
 
-    spare: tried only where the others take at least two contacts more than it has, or explain nothing.
+    spare: tried only where the others take at least two contacts more than it has, or one more that lies near the tip, or explain
+    nothing; and one that nobody told of is not as likely as the others.
     """
 
     name: str
@@ -218,10 +223,13 @@ def selection(
         if chosen is None:
             chosen = _Selection(other, torch.full((B,), h), scores, foreseen)
             continue
-        if hypothesis.spare and not bool((other.accepted & (scores[index, h] < scores[index, chosen.choice[index]])).any()):
+        best, score = scores[index, chosen.choice[index]], scores[index, h]
+        if hypothesis.spare:
+            as_many = torch.tensor([c.contacts <= hypothesis.contacts + 1 for c in candidates])[chosen.choice[index]]
+            score = score - 2 * math.log(UNTOLD) * as_many
+        if hypothesis.spare and not bool((other.accepted & (score < best)).any()):
             continue  # nothing of it in the result, then
-        best = scores[index, chosen.choice[index]]
-        chosen.swap(h, index, other, _explains_better(scores[index, h], best, other, chosen.fit, index), scores[index, h])
+        chosen.swap(h, index, other, _explains_better(score, best, other, chosen.fit, index), scores[index, h])
     assert chosen is not None
     _simplify(chosen, candidates, problems, hasty)
     if settings.restarts:
@@ -235,7 +243,8 @@ def selection(
 def _wanting(spare: Hypothesis, candidates: Sequence[Hypothesis], chosen: _Selection) -> Int[Tensor, " b"]:
     """The samples that a spare hypothesis is tried on."""
     contacts = torch.tensor([c.contacts for c in candidates])[chosen.choice]
-    more = contacts >= spare.contacts + 2
+    at_tip = (chosen.fit.location > NEAR_TIP * chosen.fit.rod_length.unsqueeze(-1)).any(-1)
+    more = (contacts >= spare.contacts + 2) | ((contacts > spare.contacts) & at_tip)
     return ((more | ~chosen.fit.accepted) & torch.isfinite(chosen.fit.chi2)).nonzero().squeeze(-1)
 
 

@@ -51,8 +51,8 @@ def contact_hypotheses(
     and smooth. locations: known ones (m), one for each contact. friction: of contacts that may drag along the rod
     (GaussianCoordinates); infinite: by any force; None: by none. With contacts "auto" an unknown tip of the problem's unknowns
     competes with nothing at the tip, unless a sensor reads it; where none is unknown, a force there is tried on samples that take
-    two contacts or that nothing explains. The rest of its unknowns is part of every hypothesis. Errors: ValueError for another
-    prior.
+    two contacts or one near the tip, or that nothing explains. The rest of its unknowns is part of every hypothesis. Errors:
+    ValueError for another prior.
     """
     known, rod = problem.unknowns, problem.robot.rod
     if load_prior == "smooth" and not (contacts in (1, "auto", "1") and locations is None and friction is None):

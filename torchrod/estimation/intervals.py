@@ -33,10 +33,10 @@ class Intervals:
     series have none.
 
     magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
-    along the rod, or None. resultant (B, 4, 2) N: of the
-    three components, in the base frame, and the size of all loads on the rod together, without weight and tip. tip (B, 6, 2) [N,
-    N m]: the unknown wrench at the tip, or None. band (B, S, 3, 2) N/m: of f_x, f_y and |f| at evenly spaced places from base to
-    tip, or None for point loads. k_hat, ess, method (B,): see Draws.
+    along the rod, or None. resultant (B, 4, 2) N: of the three components, in the base frame, and the size of all that pushes
+    together, an unknown force at the tip included, the weight not. tip (B, 6, 2) [N, N m]: the unknown wrench at the tip, or None.
+    band (B, S, 3, 2) N/m: of f_x, f_y and |f| at evenly spaced places from base to tip, or None for point loads. k_hat, ess,
+    method (B,): see Draws.
     """
 
     magnitude: Float[Tensor, "B K 2"]
@@ -87,9 +87,8 @@ def of_sizes(vectors: Float[Tensor, "B D k d"], weight: Float[Tensor, "B D"], fl
 
 
 def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:
-    """Of all loads on the rod (N, base frame): what the base carries, less the weight and what acts on the tip."""
-    state = problem.state
-    return state.base.of(x)[..., :3] - state.tip_wrench(x)[..., :3] - problem.own_weight(x)
+    """Of all that pushes, also at the tip (N, base frame): what the base carries, less the weight."""
+    return problem.state.base.of(x)[..., :3] - problem.own_weight(x)
 
 
 def intervals(draws: Draws) -> Intervals:

@@ -14,12 +14,13 @@ HEAD = [
     "## The number of loads found",
     "",
     "With `--contacts auto`. Right: that number, and a force at the tip where there is one. Of these, the shares (%) of",
-    "truths inside sampled intervals of force (of the tip's where nothing pushes) and place. Resultant: of all that was",
-    "told as pushes, where as many are told and where fewer are. Silent: accepted with other loads, a resultant outside of",
-    "its interval, no sentence about it.",
+    "truths inside sampled intervals of force (of the tip's where nothing pushes) and place. Resultant: where what",
+    "there is is told, and where other loads are. Silent: accepted with other loads, a resultant outside of its",
+    "interval, no sentence about it. Doubted: the message names another number or kind of loads. CPU in seconds a shape.",
     "",
-    "| kind | cases | right (%) | told 0 / 1 / 2 / 3 / tip | force | place | resultant, right | fewer | silent | CPU (s) |",
-    "|" + "---|" * 10,
+    "| kind | cases | right (%) | told 0 / 1 / 2 / 3 / 4 / tip | force | place | resultant, right | other | silent "
+    "| doubted | CPU (s) |",
+    "|" + "---|" * 11,
 ]
 
 
@@ -47,12 +48,12 @@ def line(name: str, cases: int) -> str:
     elif right.any() and kind.tip != "none":
         assert found.tip is not None
         cells = [share(truth.tip[:, :3], found.tip[:, :3], right), "-"]
-    whole, fewer = found.resultant[:, 3], fit.accepted & (number < K)
-    pushed = torch.where(tip, truth.resultant, truth.whole)
-    inside = (pushed >= whole[:, 0]) & (pushed <= whole[:, 1])
+    whole, pushed = found.resultant[:, 3], K or kind.tip != "none"
+    inside = (truth.resultant >= whole[:, 0]) & (truth.resultant <= whole[:, 1])
     said = torch.tensor([bool(result.diagnosis.message(b)) for b in range(cases)])
     silent = fit.accepted & ~right & ~inside & ~said
-    cells += [share(pushed, whole, rows) if K and rows.any() else "-" for rows in (right, fewer)]
-    told = " / ".join(str(int(((number == k) & ~tip).sum())) for k in range(4)) + f" / {int(tip.sum())}"
-    numbers = f"{100 * float(silent.double().mean()):.1f} | {spent:.2f}"
+    cells += [share(truth.resultant, whole, rows) if pushed and rows.any() else "-" for rows in (right, fit.accepted & ~right)]
+    told = " / ".join(str(int(((number == k) & ~tip).sum())) for k in range(5)) + f" / {int(tip.sum())}"
+    doubted = sum("remain possible" in result.diagnosis.message(b) for b in range(cases)) / cases
+    numbers = f"{100 * float(silent.double().mean()):.1f} | {100 * doubted:.1f} | {spent:.2f}"
     return f"| {kind.name} | {cases} | {100 * float(right.double().mean()):.1f} | {told} | {' | '.join(cells)} | {numbers} |"
