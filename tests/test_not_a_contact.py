@@ -64,6 +64,30 @@ def test_a_push_on_the_tip_in_any_direction_is_told_or_named():
 
 
 @pytest.mark.study
+def test_loads_that_nobody_told_of_are_named_where_one_contact_explains_the_shape():
+    """With --contacts 1: a force at the tip in any direction, and two pushes that one explains. Of one push nothing is said."""
+    random, B = torch.Generator().manual_seed(8), 60
+    way = torch.randn(B, 3, generator=random, dtype=torch.float64)
+    force = 0.5 * steel_rod().rod.force_scale * way / way.norm(dim=-1, keepdim=True)
+    tip = tr.PointWrenches(force[:, None], 0 * force[:, None], T([0.4]))
+    turn = 6.3 * torch.rand(B, 2, generator=random, dtype=torch.float64)
+    size = T([0.8, 0.15]) * steel_rod().rod.force_scale
+    both = torch.stack([size * turn.cos(), size * turn.sin(), 0 * turn], -1)
+    at = T([0.18, 0.34]) + 0.05 * torch.rand(B, 2, generator=random, dtype=torch.float64)
+    loads = {"tip": tip, "two": tr.PointForces(both, at), "one": tr.PointForces(both[:, :1], at[:, :1])}
+    said, accepted = {}, {}
+    for name, load in loads.items():
+        problem = posed(S, noisy(tr.solve_shape(steel_rod(), (load,), None, S, B, 160).p, 1e-3), 1e-3)
+        a = analyze(problem, contact_hypotheses(problem, 1), sampled=True)
+        assert not any("weighs both" in w for w in map(analyze(problem, contact_hypotheses(problem, 1)).message, range(3)))
+        accepted[name] = a.estimate.accepted
+        said[name] = torch.tensor(["--contacts auto weighs both" in a.message(b) for b in range(B)])
+    assert int(accepted["tip"].sum()) > 40 and float(said["tip"][accepted["tip"]].double().mean()) > 0.9
+    assert int(accepted["two"].sum()) > 5 and float(said["two"][accepted["two"]].double().mean()) > 0.5
+    assert accepted["one"].all() and int(said["one"].sum()) <= 2
+
+
+@pytest.mark.study
 def test_a_push_near_the_tip_stays_a_contact():
     """Though a force at the tip that pulls along the rod explains it nearly as well."""
     random, B = torch.Generator().manual_seed(7), 40

@@ -27,6 +27,7 @@ from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
 from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_intervals, joined_noise, part_of, patterns
+from .untold import untold
 
 SMOOTH_DEVIATIONS, SMOOTH_CORRELATIONS = (0.5, 2.0, 8.0), (0.1, 0.4)  # force scales / L, lengths
 MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
@@ -186,6 +187,8 @@ def analyze(
     diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
     if evidence is not None and evidence.probability is not None:
         diagnosis = replace(diagnosis, rivals=tuple(evidence.rival(b) for b in range(problem.batch)))
+    elif sampled and not shared and len(parts) == 1:
+        diagnosis = replace(diagnosis, rivals=untold(problem, found, settings, start))
     if sampled and not shared and drawn is None:
         drawn = sampled_intervals(problem, found, parts, nu=settings.robust)
     return Analysis(problem, found, parts, evidence, noise, frame, diagnosis, drawn)
