@@ -147,6 +147,24 @@ def test_the_size_of_what_may_be_nothing_may_be_nothing():
             assert torch.equal(interval, plain)
 
 
+def test_of_many_more_loads_than_there_are_nothing_is_said():
+    """Of ten loads hardly a draw has them in their order: no draws, then, and no crash, which once was a RuntimeError."""
+    problem, _, _ = weak_pushes()
+    many = problem.take(torch.arange(8)).of(unknowns_of(problem.robot, 10))
+    fit = tr.estimate(many)
+    found = tr.posterior_draws(many, fit)
+    lost = (fit.status == int(tr.Status.CONVERGED)) & ~torch.isfinite(found.weight).any(-1)
+    assert bool(lost.any()) and torch.isinf(found.k_hat[lost]).all()
+    assert torch.isnan(tr.sampled_intervals(many, fit).magnitude[lost]).all()
+
+
+def test_too_few_draws_are_refused():
+    problem, _, _ = weak_pushes()
+    fit = tr.estimate(problem)
+    with pytest.raises(ValueError, match="draws is 8; the tail of their weights needs at least 32"):
+        tr.posterior_draws(problem, fit, 8)
+
+
 @pytest.mark.study
 def test_pushes_that_nearly_cancel_are_inside_their_intervals():
     """5 to 10 % of the length apart, opposed: what is known is their couple. 60 % of forces, 62 % of places once."""

@@ -82,6 +82,24 @@ def test_the_band_of_draws_is_their_quantiles():
         assert ((found - expected).abs() < 1e-5 * expected.abs().amax((1, 2, 3), keepdim=True)).all()
 
 
+def test_a_series_as_one_load_has_its_force_and_moment_at_once():
+    """By the trapezoid on a fine grid; of no net force it lies on the rod, and of none in the middle."""
+    series = FourierCoordinates(2, 0.4, 1.5)
+    gamma = torch.randn(40, series.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    gamma[:, 0] += 6.0  # a mean that keeps the place on the rod
+    s = torch.linspace(0.0, 0.4, 20001, dtype=torch.float64)
+    f = series.loads(gamma)[0].density(s)
+    assert f is not None
+    net, report = torch.trapezoid(f[..., :2], s, dim=-2), series.describe(gamma)
+    along = (f[..., :2] * net.unsqueeze(-2)).sum(-1) / net.norm(dim=-1, keepdim=True)
+    place = torch.trapezoid(along * s, s, dim=-1) / net.norm(dim=-1)
+    assert (report.force[:, 0] - net).abs().max() < 1e-3
+    inside = (place > 0) & (place < 0.4)
+    assert int(inside.sum()) > 30 and (report.location[:, 0] - place)[inside].abs().max() < 1e-4
+    assert ((report.location >= 0) & (report.location <= 0.4)).all()
+    assert float(series.describe(series.start()).location) == pytest.approx(0.2)
+
+
 def test_a_series_is_its_own_profile_and_points_have_none():
     robot, markers = steel_rod(), contact([0.5, -0.2], 0.25, 1e-4)
     series = FourierCoordinates(3, 0.4, robot.rod.force_scale)

@@ -27,7 +27,8 @@ from .count import UNTOLD, Bar, Evidence, Hypothesis, Selection, no_bar
 
 ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
 OF_ANY_FORM = 0.0  # loads that a smooth one counts as: there are more forms of a distributed load than one
-POSSIBLE = 0.05  # of the probability: a form of the loads that is not left out
+POSSIBLE = 0.05  # of the probability: a form of the loads that is not left out,
+UNLIKELY = 0.02  # nor from force and place of a single load, which are known better and so go wrong sooner
 ANY_FORM = "smooth"
 RUNNING = 12.0  # of BIC: a hypothesis that is behind by more is out, by e^-6
 NEGLIGIBLE = 0.005  # of the probability: all other hypotheses together
@@ -71,14 +72,15 @@ def average(
         (OF_ANY_FORM if h else c.contacts) + (own.state.tip.size > 0)
         for h, c, own in zip(held.tolist(), candidates, problems, strict=True)
     ]
-    rarer = math.log(ONE_MORE) * torch.tensor(more) + math.log(UNTOLD) * torch.tensor([c.spare for c in candidates])
-    kinds = _kinds(candidates)
+    untold = math.log(UNTOLD) * torch.tensor([c.spare for c in candidates])
+    rarer = math.log(ONE_MORE) * torch.tensor(more) + untold
+    kinds, forms = _kinds(candidates), _forms_of_one_load(candidates)
     fit, choice = found.fit, found.evidence.choice.clone()
     collected = Collected(fit)
     with bar(problem.batch, "draws") as shown:
         for chunk in torch.arange(problem.batch).split(CHUNK):
             drawn = [d for h, own in enumerate(problems) for d in _drawn(own, h, found, chunk, running[chunk, h], nu)]
-            probability[chunk] = _probabilities(drawn, scores[chunk], rarer)
+            probability[chunk] = _probabilities(drawn, scores[chunk], rarer, untold)
             likeliest = _likeliest(drawn, probability[chunk], held, localized)
             for d in drawn:
                 at = chunk[d.rows]
@@ -89,7 +91,9 @@ def average(
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
                     collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen)))
-            _mix(collected, chunk, drawn, _probabilities(drawn, scores[chunk]), kinds)
+            shares = _probabilities(drawn, scores[chunk])
+            _mix(collected, chunk, drawn, shares, kinds)
+            _mix_forms(collected, chunk, drawn, shares, choice[chunk], forms)
             shown.update(len(chunk))
     evidence = replace(found.evidence, choice=choice, probability=probability)
     return Averaged(fit, evidence, collected.whole(fit))
@@ -105,13 +109,37 @@ class _Kind:
 
 def _kinds(candidates: Sequence[Hypothesis]) -> list[_Kind]:
     """Of each form of load, where there are several; and with a force at the tip that nobody told of, and without."""
-    loads = [c.unknowns.loads for c in candidates]
-    form = [getattr(f, "prior_name", "").partition("(")[0] if f.size else "" for f in loads]
+    form = [_form(c) for c in candidates]
     names = sorted({name for name in form if name})
     spare = torch.tensor([c.spare for c in candidates])
-    loaded = torch.tensor([c.unknowns.tip != "none" or f.size > 0 for c, f in zip(candidates, loads, strict=True)])
+    loaded = torch.tensor([c.unknowns.tip != "none" or c.unknowns.loads.size > 0 for c in candidates])
     found = [_Kind(torch.tensor([own == name for own in form]), name == ANY_FORM) for name in names if names[1:]]
     return found + [_Kind(mine, True) for mine in (spare, ~spare & loaded) if bool(spare.any())]
+
+
+@dataclass(frozen=True)
+class _Form:
+    """Hypotheses (H,) of one load of one form; and those of one load of any form, with the same at the tip."""
+
+    mine: Bool[Tensor, " H"]
+    alike: Bool[Tensor, " H"]
+
+
+def _forms_of_one_load(candidates: Sequence[Hypothesis]) -> list[_Form]:
+    """Where several compete, or several sizes and length scales of one."""
+    keys = [(c.unknowns.tip, _form(c)) if c.contacts == 1 and not c.spare else None for c in candidates]
+    found = []
+    for tip in sorted({key[0] for key in keys if key}):
+        names = sorted({key[1] for key in keys if key and key[0] == tip})
+        alike = torch.tensor([key is not None and key[0] == tip for key in keys])
+        found += [_Form(torch.tensor([key == (tip, name) for key in keys]), alike) for name in names]
+    return [form for form in found if int(form.alike.sum()) > 1]
+
+
+def _form(candidate: Hypothesis) -> str:
+    """Of its loads; "" for none."""
+    loads = candidate.unknowns.loads
+    return getattr(loads, "prior_name", "").partition("(")[0] if loads.size else ""
 
 
 def _running(scores: Float[Tensor, "B H"], kind: Bool[Tensor, " H"]) -> Bool[Tensor, "B H"]:
@@ -139,15 +167,21 @@ def _drawn(
 
 
 def _probabilities(
-    drawn: list[_Drawn], scores: Float[Tensor, "c H"], before: Float[Tensor, " H"] | float = 0.0
+    drawn: list[_Drawn],
+    scores: Float[Tensor, "c H"],
+    before: Float[Tensor, " H"] | float = 0.0,
+    before_bic: Float[Tensor, " H"] | float = 0.0,
 ) -> Float[Tensor, "c H"]:
-    """By the evidence and what hypotheses are worth before it, in logarithms; by the BIC where draws are not to be trusted."""
+    """By the evidence and what hypotheses are worth before it, in logarithms; where draws are not to be trusted by the BIC, which
+    weighs the number of loads by itself.
+    """
     log_evidence = torch.full_like(scores, -torch.inf)
     for d in drawn:
         sound = (d.draws.k_hat <= TRUSTED) & torch.isfinite(d.draws.log_evidence)
         log_evidence[d.rows, d.h] = torch.where(sound, d.draws.log_evidence, torch.nan)
     doubtful = log_evidence.isnan().any(-1, keepdim=True)
-    by_bic = torch.where(log_evidence == -torch.inf, -torch.inf, -0.5 * scores.nan_to_num(torch.inf, torch.inf))
+    by_bic = before_bic - 0.5 * scores.nan_to_num(torch.inf, torch.inf)
+    by_bic = torch.where(log_evidence == -torch.inf, -torch.inf, by_bic)
     return torch.softmax(torch.where(doubtful, by_bic, log_evidence + before), -1)
 
 
@@ -201,8 +235,58 @@ def _put(
         if new is None or values is None:
             continue
         old = values[at]
-        whole = torch.stack([torch.fmin(new[..., 0], old[..., 0]), torch.fmax(new[..., 1], old[..., 1])], -1)
-        values[at] = torch.where(torch.isfinite(new), whole if hull else new, old)
+        values[at] = torch.where(torch.isfinite(new), _both(new, old) if hull else new, old)
+
+
+def _both(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+    """The least interval that holds both, of which one may be NaN."""
+    return torch.stack([torch.fmin(a[..., 0], b[..., 0]), torch.fmax(a[..., 1], b[..., 1])], -1)
+
+
+def _mix_forms(
+    collected: Collected,
+    chunk: Int[Tensor, " c"],
+    drawn: list[_Drawn],
+    probability: Float[Tensor, "c H"],
+    choice: Int[Tensor, " c"],
+    forms: Sequence[_Form],
+) -> None:
+    """Force and place of a single load hold what each form has that has a share of UNLIKELY: of a load that is spread over a third
+    of the rod a Gaussian of one width knows the place too well.
+    """
+    for form in forms:
+        share = torch.where(form.mine, probability, 0.0)
+        rows = (form.alike[choice] & (share.sum(-1) > UNLIKELY)).nonzero().squeeze(-1)
+        of_form = [d for d in drawn if form.mine[d.h]]
+        if not (len(rows) and of_form):
+            continue
+        each = [(d, *_weighted(d, share, rows)) for d in of_form]
+        total = torch.cat([weight for _, _, weight in each], 1)
+        weight = total / total.sum(-1, keepdim=True)
+        reports = [d.draws.problem.unknowns.loads.describe(x[..., d.draws.problem.state.loads.at]) for d, x, _ in each]
+        force, place = (
+            torch.cat(parts, 1) for parts in zip(*((r.force[..., :1, :], r.location[..., :1]) for r in reports), strict=True)
+        )
+        known = weight.nan_to_num(1.0)
+        found = {
+            "magnitude": of_sizes(force, known),
+            "location": quantiles(place, known),
+            "force": quantiles(force.flatten(-2), known).unflatten(1, (1, 2)),
+        }
+        for name, new in found.items():
+            values = collected.values[name]
+            assert values is not None
+            values[chunk[rows], :1] = _both(_or_nan(new, weight), values[chunk[rows], :1])
+
+
+def _weighted(
+    d: _Drawn, probability: Float[Tensor, "c H"], rows: Int[Tensor, " r"]
+) -> tuple[Float[Tensor, "r D n"], Float[Tensor, "r D"]]:
+    """The draws of a hypothesis of some rows of a chunk, zero where it has none, with weights that sum to its probability."""
+    own = torch.full((len(probability),), -1).index_copy(0, d.rows, torch.arange(len(d.rows)))[rows]
+    there, some = (own >= 0).unsqueeze(-1), own.clamp(min=0)
+    weight = d.draws.weight[some].nan_to_num(0.0) * probability[rows, d.h].unsqueeze(-1)
+    return d.draws.x[some].nan_to_num(0.0), torch.where(there, weight, 0.0)
 
 
 def _mixed(
@@ -213,14 +297,11 @@ def _mixed(
         return None
     values, weights, profiles = [], [], []
     for d in drawn:
-        own = torch.full((len(probability),), -1).index_copy(0, d.rows, torch.arange(len(d.rows)))[rows]
-        there, some = own >= 0, own.clamp(min=0)
-        x, weight = d.draws.x[some], d.draws.weight[some].nan_to_num(0.0)
-        weight = torch.where(there.unsqueeze(-1), weight * probability[rows, d.h].unsqueeze(-1), 0.0)
-        values.append(resultant(d.draws.problem, x).nan_to_num(0.0))
+        x, weight = _weighted(d, probability, rows)
+        values.append(resultant(d.draws.problem, x))
         weights.append(weight)
         state, family = d.draws.problem.state, d.draws.problem.unknowns.loads
-        gamma = picked(x[..., state.loads.at].nan_to_num(0.0), systematic(weight + 1e-300, OF_BAND))
+        gamma = picked(x[..., state.loads.at], systematic(weight + 1e-300, OF_BAND))
         s = torch.linspace(0.0, d.draws.problem.robot.rod.length, NODES, dtype=DTYPE)
         profiles.append((densities(family, gamma, s), weight.sum(-1, keepdim=True) / OF_BAND))
     total = torch.cat(weights, 1)

@@ -25,6 +25,7 @@ from .score_test import score_test, start_with_one_more
 
 PROMISING = 0.4  # one more load is tried where the score test promises this much of what BIC asks for: it is linear, so only a hint
 MAX_CONTACTS = 4
+MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
 NEAR_TIP = 0.75  # of the length: a force at the tip that also pulls along the rod looks like a contact this far out, or farther
 UNTOLD = 0.05  # how probable a force at the tip is before the data where nobody told of one, times that of a contact
 CLOSE = 0.1  # of the probability: an explanation with more is told
@@ -81,7 +82,10 @@ class Evidence:
         return self.probability[:, self.loaded].sum(-1).clamp(max=1.0)
 
     def rival(self, sample: int) -> str:
-        """A sentence on another explanation that is nearly as probable as the one that was chosen; "" where there is none."""
+        """A sentence on another explanation that is nearly as probable as the one that was chosen; "" where there is none.
+
+        A force at the tip that nobody told of counts as if somebody had.
+        """
         if self.probability is None:
             return ""
         shares: dict[str, float] = {}  # smooth loads of all sizes and length scales, which stand in brackets, together
@@ -90,7 +94,8 @@ class Evidence:
             kind = name.partition("(")[0]
             shares[kind] = shares.get(kind, 0.0) + share
             evenly[kind] = evenly.get(kind, 0.0) + share / (UNTOLD if name in self.spare else 1.0)
-        chosen = self.names[int(self.choice[sample])].partition("(")[0]
+        whole = self.names[int(self.choice[sample])]
+        chosen, evenly = whole.partition("(")[0], shares if whole in self.spare else evenly
         rest = {name: share for name, share in evenly.items() if name != chosen}
         best = max(rest, key=lambda name: rest[name], default=chosen)
         if best == chosen or rest[best] < CLOSE * sum(evenly.values()):
@@ -225,11 +230,13 @@ def selection(
             continue
         best, score = scores[index, chosen.choice[index]], scores[index, h]
         if hypothesis.spare:
-            as_many = torch.tensor([c.contacts <= hypothesis.contacts + 1 for c in candidates])[chosen.choice[index]]
-            score = score - 2 * math.log(UNTOLD) * as_many
-        if hypothesis.spare and not bool((other.accepted & (score < best)).any()):
+            as_many = [not c.spare and c.contacts <= hypothesis.contacts + 1 for c in candidates]
+            score = score - 2 * math.log(UNTOLD) * torch.tensor(as_many)[chosen.choice[index]]
+        better = _explains_better(score, best, other, chosen.fit, index)
+        better = better & other.accepted if hypothesis.spare else better
+        if hypothesis.spare and not bool(better.any()):
             continue  # nothing of it in the result, then
-        chosen.swap(h, index, other, _explains_better(score, best, other, chosen.fit, index), scores[index, h])
+        chosen.swap(h, index, other, better, scores[index, h])
     assert chosen is not None
     _simplify(chosen, candidates, problems, hasty)
     if settings.restarts:

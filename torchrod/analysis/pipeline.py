@@ -23,14 +23,25 @@ from ..model.sensors import TipWrench
 from ..model.unknowns import Scope, Unknowns
 from .alternatives import other_solutions
 from .averaging import average
-from .count import MAX_CONTACTS, Bar, Evidence, Hypothesis, Parts, StartFor, no_bar, parts_of, same_kind, selection
+from .count import (
+    MAX_CONTACTS,
+    MOST_BESIDE_TIP,
+    Bar,
+    Evidence,
+    Hypothesis,
+    Parts,
+    StartFor,
+    no_bar,
+    parts_of,
+    same_kind,
+    selection,
+)
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
 from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_intervals, joined_noise, part_of, patterns
 from .untold import untold
 
 SMOOTH_DEVIATIONS, SMOOTH_CORRELATIONS = (0.5, 2.0, 8.0), (0.1, 0.4)  # force scales / L, lengths
-MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
 
 
 def learned_or_cold(problem: Problem) -> StartRule:
@@ -76,9 +87,9 @@ def contact_hypotheses(
                     smooth = SmoothCoordinates(rod.length, rod.force_scale, *scales)
                     name = f"1 {smooth.prior_name}" + f" + tip {tip}" * (len(tips) > 1 and tip != "none")
                     found.append(Hypothesis(name, 1, replace(known, loads=smooth, tip=tip)))
-    if contacts == "auto" and known.tip == "none":
+    if contacts == "auto" and known.tip == "none" and priors:  # not of one load of any form, which is all that is asked for then
         for k in range(MOST_BESIDE_TIP + 1):
-            loads = GaussianCoordinates(k, rod.length, rod.force_scale, (priors or ["contact"])[0], at, friction=friction)
+            loads = GaussianCoordinates(k, rod.length, rod.force_scale, priors[0], at, friction=friction)
             found.append(Hypothesis(f"{k} + tip force", k, replace(known, loads=loads, tip="force"), spare=True))
     return found
 
@@ -129,6 +140,7 @@ def analyze(
     start: StartFor = learned_or_cold,
     bar: Bar = no_bar,
     sampled: bool = False,
+    named: bool = False,
 ) -> Analysis:
     """Everything that `torchrod estimate` does, from readings to judged loads.
 
@@ -137,7 +149,8 @@ def analyze(
     registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
     progress, called with a total and a name. sampled: intervals and bands from draws of the posterior (estimation.draws), and the
     choice among hypotheses by their probabilities (analysis.averaging); not where all samples share a base frame, whose error the
-    draws of one sample cannot have. Errors: ValueError as torchrod.estimate.
+    draws of one sample cannot have. named: where the number of contacts is told, what nobody told of is named if it explains the
+    readings as well (analysis.untold), by two or three fits more. Errors: ValueError as torchrod.estimate.
     """
     registration = problem.unknowns.registration
     split = patterns(problem) if registration is None or registration.scope is not Scope.SHARED else []
@@ -145,7 +158,9 @@ def analyze(
         with bar(problem.batch, "samples") as shown:
             found = []
             for pattern in split:
-                found.append(analyze(part_of(problem, pattern), candidates, unknown_noise, settings, start, sampled=sampled))
+                found.append(
+                    analyze(part_of(problem, pattern), candidates, unknown_noise, settings, start, sampled=sampled, named=named)
+                )
                 shown.update(len(pattern.samples))
         return _joined(problem, found, split)
     settings, noise = settings or Settings(), None
@@ -187,7 +202,7 @@ def analyze(
     diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
     if evidence is not None and evidence.probability is not None:
         diagnosis = replace(diagnosis, rivals=tuple(evidence.rival(b) for b in range(problem.batch)))
-    elif sampled and not shared and len(parts) == 1:
+    elif named and evidence is None:
         diagnosis = replace(diagnosis, rivals=untold(problem, found, settings, start))
     if sampled and not shared and drawn is None:
         drawn = sampled_intervals(problem, found, parts, nu=settings.robust)

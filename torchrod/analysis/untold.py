@@ -7,7 +7,8 @@ contacts more probable, is named; the fit that is reported is never changed.
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -20,79 +21,84 @@ from ..model.problem import Problem
 from ..model.sensors import TipWrench
 from .alternatives import read_at_few_places
 from .averaging import ONE_MORE
-from .count import CLOSE, NEAR_TIP, StartFor, always_cold, bic
+from .count import CLOSE, MAX_CONTACTS, MOST_BESIDE_TIP, NEAR_TIP, StartFor, always_cold, bic
 
 WEIGH = "--contacts auto weighs both"
+Named = dict[int, tuple[float, str]]  # by sample: by how much the BIC is behind, and the sentence
 
 
 def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, start: StartFor = always_cold) -> tuple[str, ...]:
     """For every sample a sentence on loads that explain its readings as well as those that were told, or "".
 
-    problem: with Gaussian loads of unknown places, and nothing unknown at the tip; of another there is nothing said. fit: of it.
-    start: the rule that other fits start by.
+    problem: with Gaussian loads of unknown places, and nothing unknown at the tip; of another there is nothing said, nor of so many
+    contacts that "auto" does not try them. fit: of it. start: the rule that other fits start by.
     """
     said = [""] * problem.batch
     loads = problem.unknowns.loads
-    asked = isinstance(loads, GaussianCoordinates) and loads.count > 0 and loads.locations is None
-    if not asked or problem.unknowns.tip != "none" or any(isinstance(sensor, TipWrench) for sensor in problem.sensors):
+    if not isinstance(loads, GaussianCoordinates) or not loads.count or loads.locations is not None:
         return tuple(said)
-    settings = replace(settings or Settings(), restarts=())
-    own = bic(problem, fit)
-    whole = fit.accepted & ~read_at_few_places(problem)
-    rows = whole.nonzero().squeeze(-1)
-    for found in (_instead, _beside) if len(rows) else ():
-        for b, words in found(problem, fit, own, rows, settings, start):
+    if problem.unknowns.tip != "none" or any(isinstance(sensor, TipWrench) for sensor in problem.sensors):
+        return tuple(said)
+    rows = (fit.accepted & ~read_at_few_places(problem)).nonzero().squeeze(-1)
+    if len(rows):
+        other = _Others(problem, loads, fit, bic(problem, fit), replace(settings or Settings(), restarts=()), start)
+        named = [*_instead(other, rows).items(), *_beside(other, rows).items()]
+        for b, (_, words) in sorted(named, key=lambda item: -item[1][0]):  # the likeliest last
             said[b] = words
     return tuple(said)
 
 
-def _another(
-    problem: Problem, rows: Int[Tensor, " b"], own: Float[Tensor, " B"], share: float, settings: Settings, start: StartFor
-) -> tuple[Estimate, Float[Tensor, " b"]]:
-    """The fit of other unknowns to some samples, and by how much its BIC, that of a hypothesis with a share, is behind."""
-    part = problem.take(rows)
-    other = estimate_each(part, settings, start(part))
-    behind = bic(part, other) - 2 * math.log(share) - own[rows]
-    return other, torch.where(other.accepted, behind, torch.inf)
+@dataclass(frozen=True)
+class _Others:
+    """Fits of other loads than those of a problem and its fit, of a BIC `own` (B,)."""
+
+    problem: Problem
+    loads: GaussianCoordinates
+    fit: Estimate
+    own: Float[Tensor, " B"]
+    settings: Settings
+    start: StartFor
+
+    def of(
+        self, contacts: int, tip: Literal["none", "force"], rows: Int[Tensor, " b"], share: float = 1.0
+    ) -> tuple[Estimate, Float[Tensor, " b"]]:
+        """The fit of other loads to some samples, and by how much its BIC, that of a hypothesis with a share, is behind."""
+        part = self.problem.of(replace(self.problem.unknowns, loads=replace(self.loads, count=contacts), tip=tip)).take(rows)
+        if not part.determined:
+            return self.fit.of(rows, self.problem.size), torch.full((len(rows),), torch.inf, dtype=self.own.dtype)
+        other = estimate_each(part, self.settings, self.start(part))
+        behind = bic(part, other) - 2 * math.log(share) - self.own[rows]
+        return other, torch.where(other.accepted, behind, torch.inf)
 
 
-def _instead(
-    problem: Problem, fit: Estimate, own: Float[Tensor, " B"], rows: Int[Tensor, " b"], settings: Settings, start: StartFor
-) -> list[tuple[int, str]]:
-    """A force at the tip instead of a contact near it. It counts as if somebody had told that it may be one."""
-    loads = problem.unknowns.loads
-    assert isinstance(loads, GaussianCoordinates)
+def _instead(others: _Others, rows: Int[Tensor, " b"]) -> Named:
+    """A force at the tip instead of a contact near it, where that is needed; it counts as if somebody had told of it."""
+    fewer, fit = others.loads.count - 1, others.fit
     rows = rows[(fit.location[rows] > NEAR_TIP * fit.rod_length[rows].unsqueeze(-1)).any(-1)]
-    fewer = problem.of(replace(problem.unknowns, loads=replace(loads, count=loads.count - 1), tip="force"))
-    if not (len(rows) and fewer.determined):
-        return []
-    other, behind = _another(fewer, rows, own, 1.0, settings, start)
-    beside = f" beside {loads.count - 1} contact{'s' * (loads.count > 2)}" if loads.count > 1 else ""
-    option = f"--contacts {loads.count - 1} --unknown-tip force"
-    return [
-        (int(rows[i]), f"{_force(other, i)}{beside} explains the readings as well ({option}); {WEIGH}.")
-        for i in (behind < -2 * math.log(CLOSE)).nonzero().squeeze(-1).tolist()
-    ]
-
-
-def _beside(
-    problem: Problem, fit: Estimate, own: Float[Tensor, " B"], rows: Int[Tensor, " b"], settings: Settings, start: StartFor
-) -> list[tuple[int, str]]:
-    """One contact more, where that is more probable than that there is none."""
-    loads = problem.unknowns.loads
-    assert isinstance(loads, GaussianCoordinates)
-    more = problem.of(replace(problem.unknowns, loads=replace(loads, count=loads.count + 1)))
-    if not more.determined:
-        return []
-    contacts, behind = _another(more, rows, own, ONE_MORE, settings, start)
-    found = []
-    for i in (behind < 0).nonzero().squeeze(-1).tolist():
-        chi2 = f"chi2 = {float(contacts.chi2[i]):.3g} instead of {float(fit.chi2[rows[i]]):.3g}"
-        found.append((int(rows[i]), f"One contact more explains the readings better ({chi2}); {WEIGH}."))
+    if fewer > MOST_BESIDE_TIP or not len(rows):
+        return {}
+    rows = rows[others.of(fewer, "none", rows)[1] > 0]
+    if not len(rows):
+        return {}
+    other, behind = others.of(fewer, "force", rows)
+    beside, option = " beside 1 contact" * fewer, f"--contacts {fewer} --unknown-tip force"
+    found: Named = {}
+    for i in (behind < -2 * math.log(CLOSE)).nonzero().squeeze(-1).tolist():
+        assert other.tip is not None
+        force = ", ".join(f"{v:.3g}" for v in other.tip[i, :3].tolist())
+        words = f"A force of ({force}) N at the tip{beside} explains the readings as well ({option}); {WEIGH}."
+        found[int(rows[i])] = float(behind[i]), words
     return found
 
 
-def _force(fit: Estimate, i: int) -> str:
-    """Of a fit with an unknown force at the tip."""
-    assert fit.tip is not None
-    return f"A force of ({', '.join(f'{v:.3g}' for v in fit.tip[i, :3].tolist())}) N at the tip"
+def _beside(others: _Others, rows: Int[Tensor, " b"]) -> Named:
+    """One contact more, where that is more probable than that there is none."""
+    more = others.loads.count + 1
+    if more > MAX_CONTACTS:
+        return {}
+    other, behind = others.of(more, "none", rows, ONE_MORE)
+    found: Named = {}
+    for i in (behind < 0).nonzero().squeeze(-1).tolist():
+        chi2 = f"chi2 = {float(other.chi2[i]):.3g} instead of {float(others.fit.chi2[rows[i]]):.3g}"
+        found[int(rows[i])] = float(behind[i]), f"One contact more explains the readings better ({chi2}); {WEIGH}."
+    return found

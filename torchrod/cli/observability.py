@@ -164,6 +164,8 @@ def _worth(seen: Observability, uncertainty: Uncertainty, of: Callable[[Uncertai
         left = of(replace(uncertainty, **{kind: None if kind == "found" else 0.0})).location_std.nanmedian()
         name = "what was calibrated" if kind == "found" else kind.replace("_", " ")
         lines.append((float(1 - left / now), name))
+    if not lines:
+        return "[uncertainty] states nothing but zeros: this is of the robot as its file has it"
     said = ", ".join(f"{name} {100 * share:.0f} %" for share, name in sorted(lines, reverse=True))
     return f"spread of the location that would go if this were known exactly (median over places and directions): {said}"
 

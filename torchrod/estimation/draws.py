@@ -38,7 +38,7 @@ from .result import Estimate
 from .solve import Settings, solver_of
 from .valley import line_of, valley
 
-DRAWS = 512  # a power of two
+DRAWS, FEWEST = 512, 32  # powers of two
 ROWS = 32768  # draws evaluated at a time
 AT_ONCE = 64  # samples with a valley, each of whose fits is compared with all others
 PLAIN = Settings(restarts=(), basins=0, sized=False)
@@ -273,7 +273,8 @@ def _importance(target: _Target, first: list[tuple[Proposal, int]], count: int) 
     log_pi, x = target(seen, index)
     found = _weighed(proposals, shares, seen, log_pi, x, Method.IMPORTANCE)
     enough = count * (ENOUGH if across_strip(target.problem.robot.rod) is None else ON_STRIP)
-    where = _poor(found, enough).nonzero().squeeze(-1)
+    some = torch.isfinite(found.log_weight).any(-1)  # of many loads none may be in their order: then nothing is known
+    where = (_poor(found, enough) & some).nonzero().squeeze(-1)
     proposals, seen, log_pi, x = _of(where, proposals, seen, log_pi, x)
     log_weight = found.log_weight[where]
     for turn in range(ROUNDS):
@@ -583,11 +584,13 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
 def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu: float = math.inf) -> Draws:
     """Draws of the posterior of x of every sample that has converged: see the module.
 
-    problem: the one that was fitted. estimate: its fit. draws: how many of each sample, a power of two. nu: degrees of freedom of
-    Student's t of a robust fit. Costs 10 us a draw for a rod without weight, 30 to 100 for other robots (docs/coverage.md). Errors:
-    ValueError for an estimate of other unknowns. Source: Vehtari et al., JMLR 2024.
+    problem: the one that was fitted. estimate: its fit. draws: how many of each sample, a power of two, at least FEWEST. nu:
+    degrees of freedom of Student's t of a robust fit. Costs 10 us a draw for a rod without weight, 30 to 100 for other robots
+    (docs/coverage.md). Errors: ValueError for an estimate of other unknowns, or fewer draws. Source: Vehtari et al., JMLR 2024.
     """
     n, B = problem.size, problem.batch
+    if draws < FEWEST:
+        raise ValueError(f"draws is {draws}; the tail of their weights needs at least {FEWEST}")
     if estimate.x.shape != (B, n):
         raise ValueError(f"the estimate has x of shape {tuple(estimate.x.shape)}; this problem needs {(B, n)}")
     x = torch.full((B, draws, n), torch.nan, dtype=DTYPE)

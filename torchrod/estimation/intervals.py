@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..model.load_families import GaussianCoordinates, PaperCoordinates, PointCoordinates
 from ..model.load_families.family import LoadReport
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
@@ -29,8 +28,7 @@ CHUNK = 64  # samples at a time: their draws are not kept
 @dataclass(frozen=True)
 class Intervals:
     """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1). Where the
-    first proposal did not do (method), those of loads and tip take in the normal ones. Size and place of a load that is a
-    series have none.
+    first proposal did not do (method), those of loads and tip take in the normal ones.
 
     magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
     along the rod, or None. resultant (B, 4, 2) N: of the three components, in the base frame, and the size of all that pushes
@@ -113,9 +111,6 @@ def intervals(draws: Draws) -> Intervals:
     tip = quantiles(state.tip_wrench(x), weight) if state.tip.size else None
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
     band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
-    if not isinstance(family, GaussianCoordinates | PointCoordinates | PaperCoordinates) and place.numel():
-        # The centroid of |f|, and the size of the net force, of draws that are not smooth are not those of their mean.
-        size, place = torch.full_like(size, torch.nan), torch.full_like(place, torch.nan)
     made = Intervals(size, place, force, drag, whole, tip, band, draws.k_hat, draws.ess, draws.method)
     return _masked(made, draws.k_hat <= 1)
 

@@ -66,10 +66,14 @@ FORMS: dict[str, Form] = {
 
 @dataclass(frozen=True)
 class Held:
-    """Shares: of places where the band holds |f|, of samples whose resultant is held. width: of the band over the peak, median."""
+    """Shares: of places where the band holds |f|, of samples whose resultant is held, and of those told as one load, whose net
+    force and place (its moment over its force) are. width: of the band over the peak, median.
+    """
 
     band: float
     resultant: float
+    force: float
+    place: float
     width: float
     cpu: float
 
@@ -101,9 +105,22 @@ def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) ->
     peak = f.amax(-1, keepdim=True)
     whole, interval = shape.base_wrench[:, :3].norm(dim=-1), found.intervals.resultant[:, 3]
     inside = (low <= f) & (f <= high)
+    # All of a load pushes one way, or the other.
+    along = forces[..., 0] * turn.cos() + forces[..., 1] * turn.sin()
+    net, place = along.sum(-1), (along * L * t).sum(-1) / along.sum(-1)
+    one = torch.zeros(cases, dtype=torch.bool)
+    for unknowns, rows in found.parts:
+        one[rows] = unknowns.tip == "none" and getattr(unknowns.loads, "count", 1) == 1
+    one &= found.estimate.accepted
+
+    def held(value: Tensor, interval: Tensor, rows: Tensor) -> float:
+        return float(((interval[..., 0] <= value) & (value <= interval[..., 1]))[rows].double().mean())
+
     return Held(
         float(inside[f > LEAST * peak].double().mean()),
-        float(((interval[:, 0] <= whole) & (whole <= interval[:, 1])).double().mean()),
+        held(whole, interval, torch.ones_like(one)),
+        held(net.abs(), found.intervals.magnitude[:, 0], one),
+        held(place, found.intervals.location[:, 0], one),
         float(((high - low).mean(-1) / peak.squeeze(-1)).median()),
         cpu / cases,
     )
@@ -120,10 +137,12 @@ def head(cases: int) -> list[str]:
         f"{cases} loads a row, each made of {PIECES} point forces: with `--contacts auto --load-prior auto`, which does not know",
         "their form, and with `--load-prior smooth`. Band: share (%) of the places where |f| is above a tenth of its peak at which",
         "the 95 % band holds it; its mean width over the peak, median. Resultant: share of samples whose 95 % interval holds",
-        "|resultant|.",
+        "|resultant|. Force, place: of what is told as one load, its net force and its moment over that (none of a whole wave,",
+        "whose net force is nothing). CPU in seconds a shape.",
         "",
-        "| load, noise (of L) | auto: band | width | resultant | CPU (s) | smooth: band | width | resultant | CPU (s) |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| load, noise (of L) | auto: band | width | force | place | resultant | CPU | smooth: band | width | force | place "
+        "| resultant | CPU |",
+        "|" + "---|" * 13,
     ]
 
 
@@ -133,5 +152,6 @@ def line(row: str, cases: int) -> str:
     cells = []
     for prior in ("auto", "smooth"):
         held = measured(FORMS[name], float(noise.removesuffix(" %")) / 100, prior, cases)
-        cells += [f"{100 * held.band:.1f}", f"{held.width:.2f}", f"{100 * held.resultant:.1f}", f"{held.cpu:.2f}"]
+        of_one = ["-", "-"] if name == "sine" else [f"{100 * share:.1f}" for share in (held.force, held.place)]
+        cells += [f"{100 * held.band:.1f}", f"{held.width:.2f}", *of_one, f"{100 * held.resultant:.1f}", f"{held.cpu:.2f}"]
     return f"| {row} | {' | '.join(cells)} |"

@@ -59,17 +59,25 @@ class FourierCoordinates:
         return gamma + step
 
     def describe(self, gamma: Gamma) -> LoadReport:
-        """The whole series as one load: its net force, its centroid (by |f|) and the spread about it."""
+        """The whole series as one load: its net force, where that acts (as_one) and the spread about it."""
         return self.as_one(self.loads(gamma)[0], self.length)
 
     @staticmethod
     def as_one(load: Load, length: float) -> LoadReport:
-        """A distributed load as one, from 201 places along the rod."""
+        """A distributed load as one, from 201 places along the rod: its net force F, and the place and the spread
+
+            s_F = int s f . F ds / |F|^2,    spread^2 = int |f| (s - s_F)^2 ds / int |f| ds
+
+        so that F there has the moment of f; at the end of the rod where it would lie beyond, as it may where f changes sign.
+        """
         s = torch.linspace(0.0, length, 201, dtype=DTYPE)
         density = load.density(s)
         assert density is not None
-        weight = density.square().sum(-1).clamp(min=1e-300).sqrt()
-        centroid = (weight * s).sum(-1) / weight.sum(-1)
-        spread = ((weight * (s - centroid.unsqueeze(-1)) ** 2).sum(-1) / weight.sum(-1)).sqrt()
-        net = torch.trapezoid(density[..., :2], s, dim=-2).unsqueeze(-2)
-        return LoadReport(net, centroid.unsqueeze(-1), spread.unsqueeze(-1), net)
+        f = density[..., :2]
+        net = torch.trapezoid(f, s, dim=-2).unsqueeze(-2)
+        along, size = (f * net).sum(-1), net.square().sum((-2, -1)).clamp(min=1e-300)
+        middle = 0.5 * length  # of no force
+        place = (middle + torch.trapezoid(along * (s - middle), s, dim=-1) / size).clamp(0.0, length)
+        weight = f.square().sum(-1).clamp(min=1e-300).sqrt()
+        spread = ((weight * (s - place.unsqueeze(-1)) ** 2).sum(-1) / weight.sum(-1)).sqrt()
+        return LoadReport(net, place.unsqueeze(-1), spread.unsqueeze(-1), net)

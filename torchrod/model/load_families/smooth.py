@@ -80,5 +80,5 @@ class SmoothCoordinates:
         return gamma + step
 
     def describe(self, gamma: Gamma) -> LoadReport:
-        """The whole load as one: its net force, its centroid (by |f|) and the spread about it."""
+        """The whole load as one: its net force, where that acts and the spread about it."""
         return FourierCoordinates.as_one(self.loads(gamma)[0], self.length)
