@@ -185,7 +185,7 @@ def test_force_and_place_of_a_load_of_any_form_are_held(prior: str):
 
 
 def test_what_is_nearly_as_probable_is_told_whichever_was_chosen():
-    """A force at the tip that nobody told of counts twenty times its share where it was not chosen, and its share where it was."""
+    """A force at the tip that nobody told of counts fifty times its share where it was not chosen, and its share where it was."""
     names, tip = ("0", "1", "2", "0 + tip force"), frozenset({"0 + tip force"})
     shares = T([[0.0, 0.99, 0.0, 0.01], [0.0, 0.23, 0.25, 0.52], [0.0, 0.85, 0.15, 0.0], [0.0, 0.999, 0.0, 0.001]])
     evidence = Evidence(names, torch.tensor([1, 3, 1, 1]), shares, shares, tip, shares)
