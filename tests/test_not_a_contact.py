@@ -82,6 +82,7 @@ def test_loads_that_nobody_told_of_are_named_where_one_contact_explains_the_shap
         accepted[name] = a.estimate.accepted
         words = {"tip": "N at the tip explains", "two": "weighs both", "one": "weighs both"}[name]
         said[name] = torch.tensor([words in a.message(b) for b in range(B)])
+        assert name != "tip" or all("N at the tip explains" in a.message(b) for b in (~accepted[name]).nonzero().flatten().tolist())
     assert int(accepted["tip"].sum()) > 40 and float(said["tip"][accepted["tip"]].double().mean()) > 0.9
     assert int(accepted["two"].sum()) > 5 and float(said["two"][accepted["two"]].double().mean()) > 0.5
     assert accepted["one"].all() and int(said["one"].sum()) <= 2

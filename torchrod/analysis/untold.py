@@ -1,9 +1,10 @@
-"""Loads that nobody told of, where the number of contacts is told and the fit is accepted.
+"""Loads that nobody told of, where the number of contacts is told.
 
 A shape that one contact explains may be of a force at the tip that also pulls along the rod, which looks like a contact farther
 down, or of two loads of which the fit has made one. Both are tried: a force at the tip instead of the contact nearest to it, and
 one contact more. By the BIC, with the weights that hypotheses have in analysis.averaging, what is nearly as probable, or of more
-contacts more probable, is named; the fit that is reported is never changed.
+contacts more probable, is named. Where the fit explains nothing, a force at the tip is named that does. The fit that is reported is
+never changed.
 """
 
 import math
@@ -24,6 +25,7 @@ from .averaging import ONE_MORE
 from .count import CLOSE, MAX_CONTACTS, MOST_BESIDE_TIP, NEAR_TIP, StartFor, always_cold, bic
 
 WEIGH = "--contacts auto weighs both"
+MOST_UNEXPLAINED = 64  # samples without a fit that explains them, for which a force at the tip is tried
 Named = dict[int, tuple[float, str]]  # by sample: by how much the BIC is behind, and the sentence
 
 
@@ -39,12 +41,15 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
         return tuple(said)
     if problem.unknowns.tip != "none" or any(isinstance(sensor, TipWrench) for sensor in problem.sensors):
         return tuple(said)
-    rows = (fit.accepted & ~read_at_few_places(problem)).nonzero().squeeze(-1)
-    if len(rows):
-        other = _Others(problem, loads, fit, bic(problem, fit), replace(settings or Settings(), restarts=()), start)
-        named = [*_instead(other, rows).items(), *_beside(other, rows).items()]
-        for b, (_, words) in sorted(named, key=lambda item: -item[1][0]):  # the likeliest last
-            said[b] = words
+    many, known = ~read_at_few_places(problem), torch.isfinite(fit.chi2)
+    rows = (fit.accepted & many).nonzero().squeeze(-1)
+    unexplained = (~fit.accepted & many & known).nonzero().squeeze(-1)[:MOST_UNEXPLAINED]
+    other = _Others(problem, loads, fit, bic(problem, fit), replace(settings or Settings(), restarts=()), start)
+    named = [*_instead(other, rows).items(), *_beside(other, rows).items()] if len(rows) else []
+    for b, (_, words) in sorted(named, key=lambda item: -item[1][0]):  # the likeliest last
+        said[b] = words
+    for b, words in _explaining(other, unexplained).items():
+        said[b] = words
     return tuple(said)
 
 
@@ -81,14 +86,29 @@ def _instead(others: _Others, rows: Int[Tensor, " b"]) -> Named:
     if not len(rows):
         return {}
     other, behind = others.of(fewer, "force", rows)
-    beside, option = " beside 1 contact" * fewer, f"--contacts {fewer} --unknown-tip force"
     found: Named = {}
     for i in (behind < -2 * math.log(CLOSE)).nonzero().squeeze(-1).tolist():
-        assert other.tip is not None
-        force = ", ".join(f"{v:.3g}" for v in other.tip[i, :3].tolist())
-        words = f"A force of ({force}) N at the tip{beside} explains the readings as well ({option}); {WEIGH}."
-        found[int(rows[i])] = float(behind[i]), words
+        found[int(rows[i])] = float(behind[i]), f"{_force(other, i, fewer, ' as well')}; {WEIGH}."
     return found
+
+
+def _explaining(others: _Others, rows: Int[Tensor, " b"]) -> dict[int, str]:
+    """A force at the tip, instead of a contact or beside all, that explains what the fit does not."""
+    found: dict[int, str] = {}
+    for contacts in range(others.loads.count - 1, others.loads.count + 1):
+        left = torch.tensor([b for b in rows.tolist() if b not in found], dtype=torch.int64)
+        if contacts <= MOST_BESIDE_TIP and len(left):
+            other, behind = others.of(contacts, "force", left)
+            for i in torch.isfinite(behind).nonzero().squeeze(-1).tolist():
+                found[int(left[i])] = f"{_force(other, i, contacts)}; --contacts auto tries it too."
+    return found
+
+
+def _force(fit: Estimate, i: int, contacts: int, how: str = "") -> str:
+    """What explains a sample of a fit with a force at the tip, and the option for it."""
+    assert fit.tip is not None
+    force, beside = ", ".join(f"{v:.3g}" for v in fit.tip[i, :3].tolist()), " beside 1 contact" * contacts
+    return f"A force of ({force}) N at the tip{beside} explains the readings{how} (--contacts {contacts} --unknown-tip force)"
 
 
 def _beside(others: _Others, rows: Int[Tensor, " b"]) -> Named:
