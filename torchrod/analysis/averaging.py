@@ -23,13 +23,12 @@ from ..estimation.load_profile import NODES, densities
 from ..estimation.result import Estimate
 from ..model.problem import Problem
 from ..util.precision import DTYPE
-from .count import UNTOLD, Bar, Evidence, Hypothesis, Selection, no_bar
+from .count import ANY_FORM, UNTOLD, Bar, Evidence, Hypothesis, Selection, no_bar
 
 ONE_MORE = 0.1  # how probable one more load is before the data: one too many is worse than one that hides behind another
 OF_ANY_FORM = 0.0  # loads that a smooth one counts as: there are more forms of a distributed load than one
 POSSIBLE = 0.05  # of the probability: a form of the loads that is not left out,
 UNLIKELY = 0.02  # nor from force and place of a single load, which are known better and so go wrong sooner
-ANY_FORM = "smooth"
 RUNNING = 12.0  # of BIC: a hypothesis that is behind by more is out, by e^-6
 NEGLIGIBLE = 0.005  # of the probability: all other hypotheses together
 TRUSTED = 1.0  # of k-hat: draws whose weights are worse tell no evidence

@@ -29,6 +29,12 @@ MOST_BESIDE_TIP = 1  # contacts beside a force at the tip that nobody told of
 NEAR_TIP = 0.75  # of the length: a force at the tip that also pulls along the rod looks like a contact this far out, or farther
 UNTOLD = 0.02  # how probable a force at the tip is before the data where nobody told of one, times that of a contact
 CLOSE = 0.1  # of the probability: an explanation with more is told
+ANY_FORM = "smooth"
+OF_ANY_FORM = (
+    "No contact explains the readings: told is one load of any form along the rod, by its net force and the place of its moment. "
+    "Where several contacts may push, try --contacts auto."
+)
+OR_OF_ANY_FORM = "One load of any form along the rod explains them too: it may be spread."
 Parts = list[tuple[Unknowns, Int[Tensor, " b"]]]
 StartFor = Callable[[Problem], StartRule]
 
@@ -89,19 +95,24 @@ class Evidence:
         if self.probability is None:
             return ""
         shares: dict[str, float] = {}  # smooth loads of all sizes and length scales, which stand in brackets, together
-        evenly: dict[str, float] = {}  # what would be as likely as the others, had somebody told of it
         for name, share in zip(self.names, self.probability[sample].nan_to_num(0.0).tolist(), strict=True):
             kind = name.partition("(")[0]
             shares[kind] = shares.get(kind, 0.0) + share
-            evenly[kind] = evenly.get(kind, 0.0) + share / (UNTOLD if name in self.spare else 1.0)
-        whole = self.names[int(self.choice[sample])]
-        chosen, evenly = whole.partition("(")[0], shares if whole in self.spare else evenly
-        rest = {name: share for name, share in evenly.items() if name != chosen}
-        best = max(rest, key=lambda name: rest[name], default=chosen)
-        if best == chosen or rest[best] < CLOSE * sum(evenly.values()):
-            return ""
-        both = f"{chosen} ({100 * shares[chosen]:.0f} %) and {best} ({100 * shares[best]:.0f} %)"
-        return f"Among the numbers and kinds of loads, {both} remain possible."
+        chosen = self.names[int(self.choice[sample])]
+        any_form = sum(share for name, share in shares.items() if ANY_FORM in name)
+        if ANY_FORM in chosen:
+            return OF_ANY_FORM * (len(shares) > 1)
+        said = [OR_OF_ANY_FORM] if any_form > CLOSE else []
+        rest = {name: share for name, share in shares.items() if ANY_FORM not in name}
+        untold = self.spare if chosen not in self.spare else frozenset[str]()
+        evenly = {name: share / (UNTOLD if name in untold else 1.0) for name, share in rest.items()}
+        best = max((name for name in rest if name != chosen), key=lambda name: evenly[name], default=chosen)
+        if best != chosen and evenly[best] > CLOSE * sum(evenly.values()):
+            whole = 100 / sum(rest.values())
+            both = f"{chosen} ({whole * rest[chosen]:.0f} %) and {best} ({whole * rest[best]:.0f} %) remain possible"
+            rarer = f"; that a force acts at the tip is taken to be {1 / UNTOLD:.0f} times rarer unless --unknown-tip says so"
+            said.insert(0, f"Among the numbers and kinds of loads, {both}{rarer * bool({chosen, best} & self.spare)}.")
+        return " ".join(said)
 
 
 @dataclass(frozen=True)

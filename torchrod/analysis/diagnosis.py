@@ -126,7 +126,7 @@ class Diagnosis:
         if bool(self.tip_instead[sample]):
             said.append("A force at the tip explains the shape with fewer contacts than lateral pushes alone would take.")
         if bool(self.one_more[sample]):
-            said.append("One more contact explains the readings; try more --contacts.")
+            said.append("One more contact explains the readings; try more --contacts, or auto.")
         if self.geometry[sample]:
             said.append(self.geometry[sample])
         if self.others and (others := self.others[sample]):

@@ -6,12 +6,15 @@ import warnings
 import torch
 from jaxtyping import Bool
 from jsonargparse import Namespace
+from scipy.special import chdtr
 from torch import Tensor
 
 from ..analysis.count import Hypothesis, StartFor
 from ..analysis.diagnosis import ROBUST
 from ..analysis.pipeline import Analysis, analyze, contact_hypotheses, learned_or_cold
+from ..estimation.intervals import interval_of
 from ..estimation.load_profile import Profile
+from ..estimation.result import FittedRod
 from ..estimation.solve import Settings
 from ..estimation.starts import cold_start
 from ..estimation.walk import kernel_serves, kernel_walks
@@ -37,6 +40,7 @@ from ..model.sensors import Markers
 from ..model.unknowns import Registration, Scope, Unknowns
 from ..util.errors import InputError
 from ..util.progress import bar
+from ..util.status import Status
 from .arguments import FIGURE_SUFFIXES, NOISE, as_calibrated, in_metres, noise_or_auto, positive, writable
 from .table import table
 
@@ -46,10 +50,18 @@ MOST_RUBBING = 10  # where tendons rub as well: a second each
 ANGLE_NOISE = 0.01  # rad
 ROUGHLY = 0.15  # a share of EI: above it, intervals of a section that may be oval hold less than they say
 EXACT = (
-    "The robot is taken as exact, its {parts} too. What is only nearly known passes for a load; state it under [uncertainty] of "
-    "ROBOT.toml, or calibrate it."
+    "ROBOT.toml is taken as exact, {parts} included: an error in it shows as a load, or as a wrong force. State what is only "
+    "nearly known under [uncertainty], or run torchrod calibrate."
+)
+NARROW = (
+    "Loads are taken to be contacts, about 2.5 % of the length wide; where one may be spread along the rod, try --load-prior auto."
 )
 LATERAL = "Contacts are taken to push without drag along the rod; where they rub, state --contact-friction."
+FAR_TOO_GOOD = 1e-4  # of the probability: readings that agree even better
+GENEROUS = (
+    "chi2 = {chi2:.3g} for {dof} degrees of freedom in all: the readings are better than their stated noise, and the intervals "
+    "wider than need be; try --noise auto."
+)
 HIDDEN = (
     "Beside a push an unknown wrench at the tip hides much of it: 95 % intervals hold the truth in 75 to 90 %. Where no moment "
     "acts on the tip, --unknown-tip force tells more."
@@ -256,7 +268,7 @@ def estimate(options: Namespace) -> None:
     except ValueError as error:
         raise InputError(f"{options.shapes}: {error}") from None
     fit = found.estimate
-    print(table(fit, shapes.samples, found.diagnosis, found.noise))  # noqa: T201
+    print(table(fit, shapes.samples, found.diagnosis, found.noise, found.intervals))  # noqa: T201
     if said := _to_bear_in_mind(options, found):
         print(said)  # noqa: T201
     if options.out:
@@ -288,6 +300,12 @@ def _to_bear_in_mind(options: Namespace, found: Analysis) -> str:
         said.append(EXACT.format(parts=" and ".join([", ".join(parts), "stiffness"]) if parts else "stiffness"))
     if _friction(options) is None and options.contacts != "0" and options.load_prior != "smooth":
         said.append(LATERAL)
+        said += [NARROW] * (options.load_prior == "contact" and not options.location)
+    fit = found.estimate
+    known = fit.status == int(Status.CONVERGED)
+    chi2, dof = float(fit.chi2[known].sum()), int(fit.dof[known].sum())
+    if found.noise is None and dof > 0 and float(chdtr(dof, chi2)) < FAR_TOO_GOOD:
+        said.append(GENEROUS.format(chi2=chi2, dof=dof))
     beside = any(u.tip == "wrench" and len(rows) and not options.location and u.loads.size for u, rows in found.parts)
     if beside and all(isinstance(sensor, Markers) for sensor in problem.sensors):
         said.append(HIDDEN)
@@ -326,6 +344,10 @@ def _starts(options: Namespace, problem: Problem, candidates: list[Hypothesis]) 
     return lambda own: named if named.misfit(own, measured=False) is None else cold_start
 
 
+def _drawn_rod(found: Analysis, sample: int) -> FittedRod:
+    return found.estimate.fitted_rod(sample, found.profile, interval_of(found.estimate, found.intervals, "location"))
+
+
 def _draw(path: str, robot: Robot, shapes: Shapes, found: Analysis) -> None:
     from ..plotting.estimate import draw
 
@@ -335,9 +357,9 @@ def _draw(path: str, robot: Robot, shapes: Shapes, found: Analysis) -> None:
         warnings.warn(f"{path}: not written, because no sample has a fit to draw", stacklevel=2)
         return
     b = drawable[0]
-    title = f"{robot.name}, sample {shapes.samples[b]}: {fit.message(b)}"
+    title = f"{robot.name}, sample {shapes.samples[b]}: {found.message(b)}"
     tension = None if shapes.tension is None else shapes.tension[b]
-    rod, points, nearly = fit.fitted_rod(b, found.profile), shapes.points[b], found.problem.unknowns.uncertainty
+    rod, points, nearly = _drawn_rod(found, b), shapes.points[b], found.problem.unknowns.uncertainty
     if nearly is not None and fit.parameters is not None:
         names = [p.name for p in nearly.parameters(robot)]
         robot, warp = nearly.found_at(robot, dict(zip(names, fit.parameters[b].tolist(), strict=True)))

@@ -3,9 +3,13 @@
 import math
 import sys
 
+import torch
+from torch import Tensor
+
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
-from ..estimation.result import Estimate
+from ..estimation.intervals import Intervals
+from ..estimation.result import Z95, Estimate
 from ..util.status import Status
 from .screen import one_line
 
@@ -33,11 +37,21 @@ def _pairs(values: list[float], spreads: list[float], usual: int) -> list[str]:
     return [f"{_number(v, decimals)} +- {_number(s, decimals)}" for v, s in zip(values, spreads, strict=True)]
 
 
-def _cells(result: Estimate, there: list[tuple[int, int]]) -> list[list[str]]:
+def _spread(std: Tensor, drawn: Tensor | None) -> list[float]:
+    """One standard deviation; where there are draws, what a normal distribution has whose 95 % interval is as wide as theirs."""
+    if drawn is None:
+        return std.tolist()
+    wide = drawn.diff(dim=-1).squeeze(-1) / (2 * Z95)
+    return torch.where(wide.isnan(), std, wide).tolist()
+
+
+def _cells(result: Estimate, there: list[tuple[int, int]], drawn: Intervals | None) -> list[list[str]]:
     """The columns of HEADS, and of AXIAL, for the loads (sample, number) that there are."""
     b, k = ([pair[i] for pair in there] for i in range(2))
-    size, std = result.magnitude[b, k].tolist(), result.magnitude_std[b, k].tolist()
-    place, place_std = (1e3 * result.location[b, k]).tolist(), (1e3 * result.location_std[b, k]).tolist()
+    sizes, places = (None, None) if drawn is None else (drawn.magnitude[b, k], drawn.location[b, k])
+    size, std = result.magnitude[b, k].tolist(), _spread(result.magnitude_std[b, k], sizes)
+    place = (1e3 * result.location[b, k]).tolist()
+    place_std = [1e3 * v for v in _spread(result.location_std[b, k], places)]
     decimals = _decimals(size, std, 4)
     parts = [[_number(v, decimals) for v in result.force[b, k, i].tolist()] for i in range(2)]
     cells = [_pairs(size, std, 4), *parts, _pairs(place, place_std, 1)]
@@ -46,8 +60,10 @@ def _cells(result: Estimate, there: list[tuple[int, int]]) -> list[list[str]]:
     return [*cells, _pairs(result.axial[b, k].tolist(), result.axial_std[b, k].tolist(), 4)]
 
 
-def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noise | None) -> str:
+def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noise | None, drawn: Intervals | None = None) -> str:
     """The table on the screen: one line per load, sentences on the fits that are not accepted, and how many are.
+
+    drawn: the intervals of draws, where there are any, whose widths are then shown.
 
     On a terminal no more than MOST_LINES lines and MOST_NOTES sentences, and a word on where the rest is.
     """
@@ -55,7 +71,7 @@ def table(result: Estimate, samples: list[str], diagnosis: Diagnosis, noise: Noi
     shown = len(samples)
     if terminal and len(samples) + int((~result.accepted).sum()) > MOST_LINES:
         shown = min(shown, MOST_LINES - MOST_NOTES)
-    lines = _lines(result, samples[:shown], noise)
+    lines = _lines(result, samples[:shown], noise, drawn)
     notes, further = [], 0
     for b in _noted(result, diagnosis):
         if terminal and len(notes) == MOST_NOTES and shown < len(samples):
@@ -81,11 +97,11 @@ def _summary(result: Estimate) -> str:
     return f"{len(status)} sample{'s' * (len(status) != 1)}: {', '.join(words)}; {int(result.accepted.sum())} accepted"
 
 
-def _lines(result: Estimate, samples: list[str], noise: Noise | None) -> list[str]:
+def _lines(result: Estimate, samples: list[str], noise: Noise | None, drawn: Intervals | None) -> list[str]:
     """The head of the table, and the lines of the first samples."""
     force = result.force[: len(samples), :, 0].tolist()
     there = [(b, k) for b, row in enumerate(force) for k, v in enumerate(row) if not math.isnan(v)]
-    cells, heads = _cells(result, there), HEADS | ({} if result.axial is None else AXIAL)
+    cells, heads = _cells(result, there, drawn), HEADS | ({} if result.axial is None else AXIAL)
     widths = [max([least, *(GAP + len(cell) for cell in column)]) for least, column in zip(heads.values(), cells, strict=True)]
     loads: dict[int, list[str]] = {}
     for (b, k), row in zip(there, zip(*cells, strict=True), strict=True):

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -82,6 +83,15 @@ def of_sizes(vectors: Float[Tensor, "B D k d"], weight: Float[Tensor, "B D"], fl
     low, high = found.unbind(-1)
     unsure = (least == 0).sum(-1) >= 2
     return torch.stack([torch.where(unsure, low.minimum(least.norm(dim=-1)), low), high], -1)
+
+
+def interval_of(estimate: Estimate, drawn: Intervals | None, name: Literal["magnitude", "location"]) -> Float[Tensor, "B K 2"]:
+    """Of the draws where there are any, else of the normal distribution."""
+    own = estimate.magnitude_interval if name == "magnitude" else estimate.location_interval
+    if drawn is None:
+        return own
+    found = drawn.magnitude if name == "magnitude" else drawn.location
+    return torch.where(found.isnan(), own, found)
 
 
 def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:

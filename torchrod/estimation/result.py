@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..kernel import Sums
 from ..mechanics.jacobian import pointwise_jacobian
-from ..mechanics.loads import GaussianLoads, Load, PointForces, on_rod_fraction
+from ..mechanics.loads import FourierLoads, GaussianLoads, Load, PointForces, on_rod_fraction
 from ..model.load_families import GaussianCoordinates, LoadFamily
 from ..model.problem import TIP_ROWS, Problem
 from ..util.precision import DTYPE
@@ -23,6 +23,7 @@ from .load_profile import Profile
 from .starts import Fate, Origin
 
 Z95 = 1.959964  # of the standard normal distribution
+SAME_PROFILE, COSINES = 0.05, 40  # of the peak; of a profile that is drawn
 ACCEPT = 0.999  # accepted: chi^2 below this quantile of its distribution
 
 
@@ -53,13 +54,30 @@ class FittedRod:
         return torch.cat([self.force, axial.unsqueeze(-1)], -1)
 
     def loads(self, length: float) -> tuple[Load, ...]:
-        """The loads as mechanics.loads has them."""
+        """The loads as mechanics.loads has them: of a profile that is not that of Gaussians, a series of cosines."""
+        series = self._series(length)
+        if series is not None:
+            return (series,)
         point = self.width <= 0
         c = 0.5 / self.width[~point] ** 2
         spread = (math.pi / c).sqrt() * on_rod_fraction(self.location[~point], c, length)
         force = self.pushes
         smooth = GaussianLoads(force[~point] / spread.unsqueeze(-1), self.location[~point], c)
         return (smooth, PointForces(force[point], self.location[point]))
+
+    def _series(self, length: float) -> FourierLoads | None:
+        """The profile in cosines; None where there is none, or the loads are Gaussians that have it already."""
+        if self.profile is None or not len(self.location) or bool((self.width <= 0).any()):
+            return None
+        s, f = self.profile.s, self.profile.f
+        density = replace(self, profile=None).loads(length)[0].density(s)
+        assert density is not None
+        if float((density[..., :2] - f).norm(dim=-1).max()) < SAME_PROFILE * float(f.norm(dim=-1).max()):
+            return None
+        wave = torch.cos(torch.arange(COSINES, dtype=DTYPE) * math.pi * s.unsqueeze(-1) / length)
+        amplitude = 2 / length * torch.trapezoid(f.unsqueeze(-1) * wave.unsqueeze(-2), s, dim=0)
+        amplitude[:, 0] /= 2
+        return FourierLoads(amplitude, torch.zeros_like(amplitude[:, 1:]), 2 * length)
 
 
 @lru_cache(maxsize=4096)
@@ -251,13 +269,16 @@ class Estimate:
         what = "markers" if self.residual.shape[1] else "readings"
         return f"Converged, but {reason}: the model does not explain the {what}; {remedy}."
 
-    def fitted_rod(self, sample: int, profile: Profile | None = None) -> FittedRod:
-        """What a figure needs of one sample; profile: of all samples (torchrod.load_profile)."""
+    def fitted_rod(
+        self, sample: int, profile: Profile | None = None, location_interval: Float[Tensor, "B K 2"] | None = None
+    ) -> FittedRod:
+        """What a figure needs of one sample. profile (torchrod.load_profile), location_interval: of all samples, if not its own."""
         zeta = None if self.registration is None else self.registration[sample]
         there = torch.isfinite(self.location[sample])
         tip = None if self.tip is None or bool(self.tip[sample].isnan().all()) else self.tip[sample, :3]
         loads = (self.force[sample][there], self.location[sample][there], self.width[sample][there])
-        interval, along = self.location_interval[sample][there], None if profile is None else profile.of(sample)
+        intervals = self.location_interval if location_interval is None else location_interval
+        interval, along = intervals[sample][there], None if profile is None else profile.of(sample)
         axial = None if self.axial is None else self.axial[sample][there]
         return FittedRod(*loads, self.base_wrench[sample], zeta, tip, interval, along, axial)
 

@@ -20,7 +20,7 @@ from ..analysis.count import Evidence
 from ..analysis.diagnosis import Diagnosis
 from ..analysis.noise import Noise
 from ..estimation.draws import Method
-from ..estimation.intervals import Intervals
+from ..estimation.intervals import Intervals, interval_of
 from ..estimation.load_places import LoadPlaces
 from ..estimation.load_profile import Profile
 from ..estimation.result import Estimate, FittedRod
@@ -112,20 +112,11 @@ def _in_space(result: Result) -> dict[str, Tensor]:
     return found
 
 
-def _merged(estimate: Estimate, drawn: Intervals | None, name: str) -> Tensor:
-    """magnitude_interval or location_interval: of the draws where there are any, else of the normal distribution."""
-    own = getattr(estimate, f"{name}_interval")
-    if drawn is None:
-        return own
-    found = getattr(drawn, name)
-    return torch.where(found.isnan(), own, found)
-
-
 def _columns(result: Result) -> Columns:
     estimate, drawn = result.estimate, result.intervals
     found = {name: getattr(estimate, name) for name in COLUMNS} | _in_space(result)
     if drawn is not None:
-        found |= {f"{name}_interval": _merged(estimate, drawn, name) for name in ("magnitude", "location")}
+        found |= {f"{name}_interval": interval_of(estimate, drawn, name) for name in ("magnitude", "location")}
         found |= {"drawn_force": drawn.force, "resultant": drawn.resultant, "k_hat": drawn.k_hat, "ess": drawn.ess}
         found |= {"method": drawn.method, "tip_interval": drawn.tip, "axial_interval": drawn.axial}
     if estimate.tip_covariance is not None:
@@ -329,7 +320,7 @@ def _arrays(result: Result) -> dict[str, np.ndarray]:
         arrays["probability"] = evidence.probability
     for name in ("magnitude_location_covariance", "warm_started"):
         arrays[name] = getattr(estimate, name)
-    arrays |= {f"{name}_interval": _merged(estimate, intervals, name) for name in ("magnitude", "location")}
+    arrays |= {f"{name}_interval": interval_of(estimate, intervals, name) for name in ("magnitude", "location")}
     if intervals is not None:
         arrays |= {"force_interval": intervals.force, "resultant_interval": intervals.resultant, "tip_interval": intervals.tip}
         arrays["axial_interval"] = intervals.axial
