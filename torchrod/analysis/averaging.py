@@ -45,12 +45,13 @@ class Averaged:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """Draws by hypothesis h of some samples of a chunk."""
+    """Draws by hypothesis h of some samples of a chunk. spare: it has a force at the tip that nobody told of."""
 
     h: int
     rows: Int[Tensor, " b"]
     fit: Estimate
     draws: Draws
+    spare: bool
 
 
 def average(
@@ -78,7 +79,9 @@ def average(
     collected = Collected(fit)
     with bar(problem.batch, "draws") as shown:
         for chunk in torch.arange(problem.batch).split(CHUNK):
-            drawn = [d for h, own in enumerate(problems) for d in _drawn(own, h, found, chunk, running[chunk, h], nu)]
+            drawn = []
+            for h, own in enumerate(problems):
+                drawn += _drawn(own, h, candidates[h].spare, found, chunk, running[chunk, h], nu)
             probability[chunk] = _probabilities(drawn, scores[chunk], rarer, untold)
             likeliest = _likeliest(drawn, probability[chunk], held, localized)
             for d in drawn:
@@ -89,7 +92,7 @@ def average(
             for d in drawn:
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
-                    collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen)))
+                    collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen), candidates[d.h].spare))
             shares = _probabilities(drawn, scores[chunk])
             _mix(collected, chunk, drawn, shares, kinds)
             _mix_forms(collected, chunk, drawn, shares, choice[chunk], forms)
@@ -148,7 +151,7 @@ def _running(scores: Float[Tensor, "B H"], kind: Bool[Tensor, " H"]) -> Bool[Ten
 
 
 def _drawn(
-    own: Problem, h: int, found: Selection, chunk: Int[Tensor, " c"], running: Bool[Tensor, " c"], nu: float
+    own: Problem, h: int, spare: bool, found: Selection, chunk: Int[Tensor, " c"], running: Bool[Tensor, " c"], nu: float
 ) -> list[_Drawn]:
     """Draws by hypothesis h of those samples of a chunk for which it is in the running: of the chosen fit, and of the others."""
     chosen, drawn = found.evidence.choice[chunk] == h, []
@@ -161,7 +164,7 @@ def _drawn(
         rows = wanted.nonzero().squeeze(-1)
         if len(rows):
             part = fit.of(place[rows], own.size)
-            drawn.append(_Drawn(h, rows, part, posterior_draws(own.take(chunk[rows]), part, nu=nu)))
+            drawn.append(_Drawn(h, rows, part, posterior_draws(own.take(chunk[rows]), part, nu=nu), spare))
     return drawn
 
 
@@ -297,7 +300,7 @@ def _mixed(
     values, weights, profiles = [], [], []
     for d in drawn:
         x, weight = _weighted(d, probability, rows)
-        values.append(resultant(d.draws.problem, x))
+        values.append(resultant(d.draws.problem, x, d.spare))
         weights.append(weight)
         state, family = d.draws.problem.state, d.draws.problem.unknowns.loads
         gamma = picked(x[..., state.loads.at], systematic(weight + 1e-300, OF_BAND))

@@ -33,9 +33,9 @@ class Intervals:
 
     magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
     along the rod, or None. resultant (B, 4, 2) N: of the three components, in the base frame, and the size of all that pushes
-    together, an unknown force at the tip included, the weight not. tip (B, 6, 2) [N, N m]: the unknown wrench at the tip, or None.
-    band (B, S, 3, 2) N/m: of f_x, f_y and |f| at evenly spaced places from base to tip, or None for point loads. k_hat, ess,
-    method (B,): see Draws.
+    together, without the weight and the unknown tip; but with a force at the tip that nobody told of. tip (B, 6, 2) [N, N m]: the
+    unknown wrench at the tip, or None. band (B, S, 3, 2) N/m: of f_x, f_y and |f| at evenly spaced places from base to tip, or None
+    for point loads. k_hat, ess, method (B,): see Draws.
     """
 
     magnitude: Float[Tensor, "B K 2"]
@@ -94,21 +94,23 @@ def interval_of(estimate: Estimate, drawn: Intervals | None, name: Literal["magn
     return torch.where(found.isnan(), own, found)
 
 
-def resultant(problem: Problem, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D 3"]:
-    """Of all that pushes, also at the tip (N, base frame): what the base carries, less the weight."""
-    return problem.state.base.of(x)[..., :3] - problem.own_weight(x)
+def resultant(problem: Problem, x: Float[Tensor, "B D n"], with_tip: bool = False) -> Float[Tensor, "B D 3"]:
+    """Of all loads on the rod (N, base frame): what the base carries, less the weight and, but with_tip, what acts on the tip."""
+    loads = problem.state.base.of(x)[..., :3] - problem.own_weight(x)
+    return loads if with_tip else loads - problem.state.tip_wrench(x)[..., :3]
 
 
-def intervals(draws: Draws) -> Intervals:
+def intervals(draws: Draws, with_tip: bool = False) -> Intervals:
     """The intervals of draws; those of force and place of several pushes hold what an even prior of the forces has as well.
 
+    with_tip: the resultant counts an unknown force at the tip.
     Which of two priors of ignorance is meant, even in the logarithm of the forces' size or in the forces, nobody has said, and of
     pushes that nearly cancel it decides how large they are and how far apart (Chart.log_even).
     """
     problem, x, weight = draws.problem, draws.x, draws.weight
     family, state, chart = problem.unknowns.loads, problem.state, Chart(problem, x[:, 0], None)
     gamma = x[..., state.loads.at]
-    report, R = family.describe(gamma), resultant(problem, x)
+    report, R = family.describe(gamma), resultant(problem, x, with_tip)
     size, place, force = _of_loads(problem, report, weight)
     even = chart.log_even(x[..., : chart.size])
     if even is not None:

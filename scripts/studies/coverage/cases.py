@@ -68,13 +68,14 @@ COUNTED = {
 
 @dataclass(frozen=True)
 class Truth:
-    """size, at (B, K) N, m, in the order along the rod; tip (B, 6) [N, N m]; resultant (B,) N: of
-    all that pushes, at the tip too."""
+    """size, at (B, K) N, m, in the order along the rod; tip (B, 6) [N, N m]; resultant, whole
+    (B,) N: of the pushes, and with the force at the tip."""
 
     size: Tensor
     at: Tensor
     tip: Tensor
     resultant: Tensor
+    whole: Tensor
 
 
 def _uniform(low: float, high: float, random: torch.Generator, *shape: int) -> Tensor:
@@ -122,5 +123,6 @@ def posed(kind: Kind, cases: int, seed: int = 0) -> tuple[tr.Problem, Truth]:
     noise = kind.noise * rod.length
     unknowns = tr.Unknowns(tr.GaussianCoordinates(K, rod.length, rod.force_scale), kind.unknown)
     readings = shape.p + noise * torch.randn(shape.p.shape, generator=random, dtype=torch.float64)
-    truth = Truth(size, at, tip, shape.base_wrench[:, :3].norm(dim=-1))
+    force = shape.base_wrench[:, :3]
+    truth = Truth(size, at, tip, (force - tip[:, :3]).norm(dim=-1), force.norm(dim=-1))
     return tr.Problem(robot, unknowns, [tr.Markers(s, readings, noise)]), truth

@@ -49,10 +49,10 @@ def line(name: str, cases: int) -> str:
         assert found.tip is not None
         cells = [share(truth.tip[:, :3], found.tip[:, :3], right), "-"]
     whole, pushed = found.resultant[:, 3], K or kind.tip != "none"
-    inside = (truth.resultant >= whole[:, 0]) & (truth.resultant <= whole[:, 1])
+    inside = (truth.whole >= whole[:, 0]) & (truth.whole <= whole[:, 1])
     said = torch.tensor([bool(result.diagnosis.message(b)) for b in range(cases)])
     silent = fit.accepted & ~right & ~inside & ~said
-    cells += [share(truth.resultant, whole, rows) if pushed and rows.any() else "-" for rows in (right, fit.accepted & ~right)]
+    cells += [share(truth.whole, whole, rows) if pushed and rows.any() else "-" for rows in (right, fit.accepted & ~right)]
     told = " / ".join(str(int(((number == k) & ~tip).sum())) for k in range(5)) + f" / {int(tip.sum())}"
     doubted = sum("remain possible" in result.diagnosis.message(b) for b in range(cases)) / cases
     numbers = f"{100 * float(silent.double().mean()):.1f} | {100 * doubted:.1f} | {spent:.2f}"
