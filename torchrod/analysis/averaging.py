@@ -92,7 +92,7 @@ def average(
             for d in drawn:
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
-                    collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen), candidates[d.h].spare))
+                    collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen), d.spare))
             shares = _probabilities(drawn, scores[chunk])
             _mix(collected, chunk, drawn, shares, kinds)
             _mix_forms(collected, chunk, drawn, shares, choice[chunk], forms)

@@ -30,11 +30,11 @@ NEAR_TIP = 0.75  # of the length: a force at the tip that also pulls along the r
 UNTOLD = 0.02  # how probable a force at the tip is before the data where nobody told of one, times that of a contact
 CLOSE = 0.1  # of the probability: an explanation with more is told
 ANY_FORM = "smooth"
-OF_ANY_FORM = (
+TOLD_ANY_FORM = (
     "No contact explains the readings: told is one load of any form along the rod, by its net force and the place of its moment. "
     "Where several contacts may push, try --contacts auto."
 )
-OR_OF_ANY_FORM = "One load of any form along the rod explains them too: it may be spread."
+OR_ANY_FORM = "One load of any form along the rod explains them too: it may be spread."
 Parts = list[tuple[Unknowns, Int[Tensor, " b"]]]
 StartFor = Callable[[Problem], StartRule]
 
@@ -101,8 +101,8 @@ class Evidence:
         chosen = self.names[int(self.choice[sample])]
         any_form = sum(share for name, share in shares.items() if ANY_FORM in name)
         if ANY_FORM in chosen:
-            return OF_ANY_FORM * (len(shares) > 1)
-        said = [OR_OF_ANY_FORM] if any_form > CLOSE else []
+            return TOLD_ANY_FORM * (len(shares) > 1)
+        said = [OR_ANY_FORM] if any_form > CLOSE else []
         rest = {name: share for name, share in shares.items() if ANY_FORM not in name}
         untold = self.spare if chosen not in self.spare else frozenset[str]()
         evenly = {name: share / (UNTOLD if name in untold else 1.0) for name, share in rest.items()}

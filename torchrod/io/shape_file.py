@@ -63,7 +63,8 @@ def read_shapes(path: str | Path, robot: Robot, units: str | None = None, tensio
         raise InputError(f"{path}: tensions are missing; the robot has {T} tendons, add tension_1..tension_{T} (N) or --tensions")
     given = 0 if markers.tension is None else markers.tension.shape[-1]
     if given != T:
-        raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; give one per tendon, in N")
+        remedy = "give one per tendon, in N" if T else "leave them out, or add a [[tendons]] table for each to ROBOT.toml"
+        raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; {remedy}")
     _check_pulls(cells, markers, robot)
     if bool(gap.any()):
         _warn_of_gaps(path, gap, markers.s)
@@ -355,7 +356,11 @@ def _centre_line(
 def _check_header(path: Path, names: list[str]) -> tuple[list[Kind], list[str]]:
     """The kinds of measurement that there are, and the tensions' columns in their order."""
     if "s" not in names and not {*POSITIONS.columns} <= {*names}:
-        raise InputError(f"{path}: column 's' is missing; the header starts with s,x,y,z, or with x,y,z of a centre line")
+        found = ",".join(names[:6])
+        raise InputError(
+            f"{path}: column 's' is missing; the first line is a header that starts with s,x,y,z, or with x,y,z of a centre line, "
+            f"not with {found!r}"
+        )
     known = [*COLUMNS, *(name for name in names if TENSION.fullmatch(name))]
     for name in names:
         if name in known and names.count(name) > 1:
