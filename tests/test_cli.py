@@ -237,7 +237,7 @@ BAD = {
     "millimetres": (ROD, "s,x,y,z\n" + "".join(f"{0.1 * i:g},0,0,{100 * i}\n" for i in range(1, 5)), [], "give metres"),
     "too few markers": (ROD, "s,x,y,z\n0.4,0,0,0.4\n", [], "add markers"),
     "no tensions": (TENDON, STRAIGHT, [], "tensions are missing"),
-    "tensions of a passive rod": (ROD, "s,x,y,z,tension_1\n0.2,0,0,0.2,1\n0.4,0,0,0.4,1\n", [], "one per tendon"),
+    "tensions of a passive rod": (ROD, "s,x,y,z,tension_1\n0.2,0,0,0.2,1\n0.4,0,0,0.4,1\n", [], "leave them out, or add a"),
     "tensions that change": (TENDON, "s,x,y,z,tension_1\n0.2,0,0,0.2,1\n0.4,0,0,0.4,2\n", [], "differ from row to row"),
     "noise": (ROD, STRAIGHT, ["--noise", "-1"], "--noise is -1.0"),
     "noise is a word": (ROD, STRAIGHT, ["--noise", "much"], "much"),

@@ -64,7 +64,7 @@ def read_shapes(path: str | Path, robot: Robot, units: str | None = None, tensio
     given = 0 if markers.tension is None else markers.tension.shape[-1]
     if given != T:
         remedy = "give one per tendon, in N" if T else "leave them out, or add a [[tendons]] table for each to ROBOT.toml"
-        raise InputError(f"{path}: has {given} tensions but the robot has {T} tendons; {remedy}")
+        raise InputError(f"{path}: has tensions of {given} tendons but the robot has {T}; {remedy}")
     _check_pulls(cells, markers, robot)
     if bool(gap.any()):
         _warn_of_gaps(path, gap, markers.s)
