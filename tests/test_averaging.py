@@ -8,9 +8,19 @@ import pytest
 import torch
 
 from tests.robots import T, steel_rod
-from torchrod import GaussianCoordinates, Markers, PointForces, Problem, Unknowns, analyze, contact_hypotheses, solve_shape
-from torchrod.analysis.averaging import ONE_MORE, average
-from torchrod.analysis.count import Evidence, selection
+from torchrod import (
+    GaussianCoordinates,
+    Markers,
+    PointForces,
+    Problem,
+    Unknowns,
+    analyze,
+    contact_hypotheses,
+    estimate,
+    solve_shape,
+)
+from torchrod.analysis.averaging import ONE_MORE, _Drawn, _probabilities, average
+from torchrod.analysis.count import UNTOLD, Evidence, selection
 from torchrod.cli import main
 from torchrod.estimation.draws import posterior_draws
 from torchrod.estimation.intervals import quantiles, resultant
@@ -194,3 +204,32 @@ def test_what_is_nearly_as_probable_is_told_whichever_was_chosen():
     assert "0 + tip force (52 %) and 2 (25 %) remain possible" in said[1]
     assert "1 (85 %) and 2 (15 %) remain possible" in said[2]
     assert not said[3]
+
+
+def test_a_load_of_any_form_is_told_of_in_words():
+    """Its share is on a scale of its own: beside contacts it is not given in percent, and where it is told, it says what it is."""
+    names = ("0", "1 contact", "2 contact", "1 smooth(0.1 L, 2)", "1 smooth(0.4 L, 2)")
+    shares = T([[0.0, 0.0, 0.01, 0.5, 0.49], [0.0, 0.97, 0.01, 0.01, 0.01], [0.0, 0.0, 0.0, 0.3, 0.7]])
+    evidence = Evidence(names, torch.tensor([2, 1, 4]), shares, shares, frozenset(), shares)
+    assert evidence.rival(0) == "One load of any form along the rod explains them too: it may be spread."
+    assert not evidence.rival(1)
+    assert "told is one load of any form" in evidence.rival(2) and "try --contacts auto" in evidence.rival(2)
+    alone = Evidence(names[3:], torch.tensor([1]), shares[2:, 3:], shares[2:, 3:], frozenset(), shares[2:, 3:])
+    assert not alone.rival(0)  # of --load-prior smooth, which asked for just that
+
+
+def test_one_load_of_any_form_competes_with_nothing_at_the_tip():
+    problem, _ = posed(1, 1, (0.3, 0.6))
+    assert not [c for c in contact_hypotheses(problem, "auto", "smooth") if c.unknowns.tip != "none"]
+    assert [c for c in contact_hypotheses(problem, "auto", "auto") if c.unknowns.tip != "none"]
+
+
+def test_where_draws_are_not_trusted_the_bic_counts_what_nobody_told_of():
+    """Two hypotheses of one BIC, of which one has a force at the tip that nobody told of."""
+    problem, _ = posed(2, 1, (0.3, 0.6))
+    fit = estimate(problem)
+    draws = replace(posterior_draws(problem, fit, 64), k_hat=T([2.0, 2.0]))
+    drawn = [_Drawn(h, torch.arange(2), fit, draws, h == 1) for h in range(2)]
+    before = T([0.0, math.log(UNTOLD)])
+    found = _probabilities(drawn, torch.full((2, 2), 50.0, dtype=DTYPE), before, before)
+    assert torch.allclose(found, (T([1.0, UNTOLD]) / (1 + UNTOLD)).expand(2, -1))

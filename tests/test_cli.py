@@ -15,8 +15,19 @@ import pytest
 import torch
 
 from tests.conftest import reference
-from tests.robots import csv_of, toml_of
-from torchrod import Markers, PointCoordinates, Problem, Unknowns, bounds, estimate, read_robot, read_shapes
+from tests.robots import csv_of, steel_rod, toml_of
+from torchrod import (
+    Markers,
+    PointCoordinates,
+    PointForces,
+    Problem,
+    Unknowns,
+    bounds,
+    estimate,
+    read_robot,
+    read_shapes,
+    solve_shape,
+)
 from torchrod.analysis.marker_placement import even_layout
 from torchrod.cli import main
 from torchrod.cli.parser import COMMANDS
@@ -460,3 +471,33 @@ def test_what_an_unknown_wrench_at_the_tip_hides_is_said(tmp_path, capsys):
     ):
         run(tmp_path, ROD, shapes, *options)
         assert ("hides much of it" in capsys.readouterr().out) == said, options
+
+
+def test_the_table_shows_the_intervals_of_the_result(tmp_path, capsys):
+    """+- is a 95 % interval's width over 3.92: of draws, which RESULT holds, not of the covariance. Of markers far better than
+    their stated noise there is a word.
+    """
+    s = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
+    push = PointForces(torch.tensor([[[0.5, 0.2, 0.0]]]), torch.tensor([[0.22]]))
+    p = solve_shape(steel_rod(), (push,), None, s, 1).p[0]
+    p = p + 1e-3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    rows = [f"{at},{x},{y},{z}\n" for at, (x, y, z) in zip(s.tolist(), p.tolist(), strict=True)]
+    ratios = []
+    for noise, generous in (("1e-3", False), ("5e-3", True)):
+        result = run(tmp_path, ROD, "s,x,y,z\n" + "".join(rows), "--noise", noise, "--load-prior", "auto")
+        said = capsys.readouterr().out
+        (load,) = result["results"][0]["loads"]
+        cells = said.splitlines()[1].split()
+        low, high = load["interval_95"]["location_m"]
+        shown = float(cells[cells.index("+-", cells.index("+-") + 1) + 1])
+        assert shown == pytest.approx(1e3 * (high - low) / 3.92, rel=0.06, abs=0.06)
+        assert ("the readings are better than their stated noise" in said) == generous
+        ratios.append((high - low) / 3.92 / load["std"]["location_m"])
+    assert max(abs(ratio - 1) for ratio in ratios) > 0.15  # the covariance says something else
+
+
+def test_where_loads_may_be_spread_is_said(tmp_path, capsys):
+    case = CASES["passive-point-0"]
+    for options, word in (((), True), (("--load-prior", "auto"), False), (("--location", "0.2"), False)):
+        run(tmp_path, ROD, csv_of(case), "--noise", "1e-4", *options)
+        assert ("where one may be spread along the rod, try --load-prior auto" in capsys.readouterr().out) == word

@@ -228,3 +228,10 @@ def test_what_does_not_fit_is_refused():
     ):
         with pytest.raises(ValueError, match=r"must|give"):
             bad()
+
+
+def test_an_uncertainty_of_nothing_but_zeros_is_said_to_be_none(tmp_path, capsys):
+    """Once the sentence ended on a colon."""
+    (tmp_path / "robot.toml").write_text(ROD + "\n[uncertainty]\nstiffness = 0.0\nset = 0.0\n")
+    assert main(["observability", str(tmp_path / "robot.toml"), "--markers", "10", "--force", "1"]) == 0
+    assert "[uncertainty] states nothing but zeros" in capsys.readouterr().out

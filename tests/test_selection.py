@@ -9,7 +9,18 @@ from studies import contacts
 
 from tests.problems import unknowns_of
 from tests.robots import T, steel_rod
-from torchrod import GaussianLoads, Markers, PointForces, PointWrenches, Problem, estimate, score_test, solve_shape
+from torchrod import (
+    GaussianLoads,
+    Markers,
+    PointForces,
+    PointWrenches,
+    Problem,
+    analyze,
+    contact_hypotheses,
+    estimate,
+    score_test,
+    solve_shape,
+)
 from torchrod.analysis.count import Hypothesis, bic, select
 from torchrod.analysis.score_test import start_with_one_more
 from torchrod.cli import main
@@ -152,3 +163,20 @@ def test_the_start_of_one_more_load_costs_less_than_the_fit_that_was_tested():
     fit = estimate(one)
     start = start_with_one_more(two.unknowns, score_test(one, fit.x))
     assert float(evaluator(two).cost(start.x)) < 0.8 * float(fit.cost)
+
+
+@pytest.mark.many_fits
+def test_without_draws_too_what_one_sample_chooses_does_not_depend_on_its_neighbours():
+    """Where a force at the tip helps one sample, it was once chosen for others that it does not explain."""
+    random, B = torch.Generator().manual_seed(2), 8
+    way = torch.randn(B, 3, generator=random, dtype=torch.float64)
+    force = 0.5 * steel_rod().rod.force_scale * way / way.norm(dim=-1, keepdim=True)
+    p = markers_of((PointWrenches(force[:, None], 0 * force[:, None], T([0.4])),), B, 3).positions
+    noise = torch.tensor([[1e-3]] + [[5e-4]] * (B - 1)).expand(-1, len(S))  # of the first alone as it is
+    problem = Problem(steel_rod(), unknowns_of(steel_rod()), [Markers(S, p, noise)])
+    candidates = contact_hypotheses(problem)
+    together = analyze(problem, candidates)
+    assert together.evidence is not None
+    for b in range(B):
+        alone = analyze(problem.take(torch.tensor([b])), candidates).evidence
+        assert alone is not None and int(alone.choice[0]) == int(together.evidence.choice[b])

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..estimation.draws import Draws, picked, posterior_draws, systematic
-from ..estimation.intervals import CHUNK, Collected, Intervals, intervals, of_sizes, quantiles, resultant
+from ..estimation.intervals import CHUNK, Collected, Intervals, either, intervals, of_sizes, quantiles, resultant
 from ..estimation.load_profile import DRAWS as OF_BAND
 from ..estimation.load_profile import NODES, densities
 from ..estimation.result import Estimate
@@ -237,12 +237,7 @@ def _put(
         if new is None or values is None:
             continue
         old = values[at]
-        values[at] = torch.where(torch.isfinite(new), _both(new, old) if hull else new, old)
-
-
-def _both(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-    """The least interval that holds both, of which one may be NaN."""
-    return torch.stack([torch.fmin(a[..., 0], b[..., 0]), torch.fmax(a[..., 1], b[..., 1])], -1)
+        values[at] = torch.where(torch.isfinite(new), either(new, old) if hull else new, old)
 
 
 def _mix_forms(
@@ -278,7 +273,7 @@ def _mix_forms(
         for name, new in found.items():
             values = collected.values[name]
             assert values is not None
-            values[chunk[rows], :1] = _both(_or_nan(new, weight), values[chunk[rows], :1])
+            values[chunk[rows], :1] = either(_or_nan(new, weight), values[chunk[rows], :1])
 
 
 def _weighted(

@@ -258,11 +258,8 @@ def estimate(options: Namespace) -> None:
         warnings.warn("--load-prior auto weighs contact against distributed alone: smooth loads need draws", stacklevel=2)
         candidates = [c for c in candidates if not isinstance(c.unknowns.loads, SmoothCoordinates)]
     try:
-        start, named = (
-            _starts(options, problem, candidates),
-            problem.batch <= (MOST_PROFILES if kernel_walks(problem) else MOST_DRAWN),
-        )
-        found = analyze(problem, candidates, noise is None, settings, start, bar, sampled, named)
+        named = problem.batch <= (MOST_PROFILES if kernel_walks(problem) else MOST_DRAWN)
+        found = analyze(problem, candidates, noise is None, settings, _starts(options, problem, candidates), bar, sampled, named)
     except InputError:  # names its own file
         raise
     except ValueError as error:
@@ -293,7 +290,7 @@ def estimate(options: Namespace) -> None:
 
 
 def _to_bear_in_mind(options: Namespace, found: Analysis) -> str:
-    """What is taken as known where nobody said that it is not, and what intervals do not hold; "" where there is nothing."""
+    """What is taken as known where nobody said that it is not, and where intervals are wrong; "" where there is nothing."""
     said, problem = [], found.problem
     if problem.unknowns.uncertainty is None:
         parts = ["tensions"] * (not problem.state.tension.size) + ["friction"] if len(problem.robot.tendons) else []

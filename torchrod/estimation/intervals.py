@@ -117,7 +117,7 @@ def intervals(draws: Draws, with_tip: bool = False) -> Intervals:
         log_weight, _ = smoothed((weight.log() + even).nan_to_num(-1e9, neginf=-1e9))
         # Where the two priors contradict each other few draws count here. They explain the readings all the same.
         other = _of_loads(problem, report, log_weight.exp())
-        size, place, force = (_either(own, more) for own, more in zip((size, place, force), other, strict=True))
+        size, place, force = (either(own, more) for own, more in zip((size, place, force), other, strict=True))
     whole = torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight, _flat(problem))], 1)
     drag = None if report.axial is None else quantiles(report.axial, weight)
     tip = quantiles(state.tip_wrench(x), weight) if state.tip.size else None
@@ -141,9 +141,9 @@ def _flat(problem: Problem) -> bool:
     return min(problem.robot.rod.sides) < FLAT
 
 
-def _either(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
-    """The least interval that holds both."""
-    return torch.stack([a[..., 0].minimum(b[..., 0]), a[..., 1].maximum(b[..., 1])], -1)
+def either(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+    """The least interval that holds both, of which one may be NaN."""
+    return torch.stack([torch.fmin(a[..., 0], b[..., 0]), torch.fmax(a[..., 1], b[..., 1])], -1)
 
 
 def _masked(made: Intervals, sound: Tensor) -> Intervals:
@@ -225,8 +225,8 @@ def _hull(drawn: Intervals, fit: Estimate) -> Intervals:
     def joined(own: Tensor | None, normal: Tensor | None) -> Tensor | None:
         if own is None or normal is None:
             return own
-        both = _either(own, normal)
-        return torch.where(doubtful.reshape(-1, *[1] * (own.ndim - 1)) & torch.isfinite(both), both, own)
+        known = torch.isfinite(own) & torch.isfinite(normal)
+        return torch.where(doubtful.reshape(-1, *[1] * (own.ndim - 1)) & known, either(own, normal), own)
 
     def about(value: Tensor | None, std: Tensor | None) -> Tensor | None:
         return (
