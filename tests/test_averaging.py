@@ -233,3 +233,40 @@ def test_where_draws_are_not_trusted_the_bic_counts_what_nobody_told_of():
     before = T([0.0, math.log(UNTOLD)])
     found = _probabilities(drawn, torch.full((2, 2), 50.0, dtype=DTYPE), before, before)
     assert torch.allclose(found, (T([1.0, UNTOLD]) / (1 + UNTOLD)).expand(2, -1))
+
+
+def test_an_interval_of_a_load_of_any_form_is_of_all_sizes_and_length_scales():
+    """And so it is wider than that of the one pair which is the likeliest."""
+    problem, _ = posed(8, 4, (0.3, 0.6))
+    candidates = contact_hypotheses(problem, 1, "smooth")
+    found = analyze(problem, candidates, sampled=True)
+    assert found.intervals is not None and found.evidence is not None
+    wider = []
+    for b, h in enumerate(found.evidence.choice.tolist()):
+        alone = analyze(problem.of(candidates[h].unknowns).take(torch.tensor([b])), sampled=True).intervals
+        assert alone is not None
+        own, every = alone.location[0, 0], found.intervals.location[b, 0]
+        assert bool(every[0] <= own[0] + 1e-9) and bool(every[1] >= own[1] - 1e-9)
+        wider.append(float(every.diff() / own.diff()))
+    assert max(wider) > 1.1
+
+
+@pytest.mark.study
+def test_a_pull_at_the_tip_passes_for_opposed_pushes_near_it_and_the_resultant_holds_both():
+    """Two opposed pushes 5 to 10 % of the length apart on the outer third: once half of those told with a force at the tip."""
+    random, robot, B = torch.Generator().manual_seed(3), steel_rod(), 60
+    first = 0.65 + 0.25 * torch.rand(B, 1, generator=random, dtype=DTYPE)
+    place = L * torch.cat([first, first + 0.05 + 0.05 * torch.rand(B, 1, generator=random, dtype=DTYPE)], -1)
+    size = robot.rod.force_scale * (0.5 + 1.5 * torch.rand(B, 2, generator=random, dtype=DTYPE))
+    turn = 2 * math.pi * torch.rand(B, 1, generator=random, dtype=DTYPE) + math.pi * torch.arange(2)
+    F = torch.stack([size * turn.cos(), size * turn.sin(), 0 * turn], -1)
+    rod = solve_shape(robot, (PointForces(F, place),), None, S, B, 160)
+    p = rod.p + 4e-4 * torch.randn(rod.p.shape, generator=random, dtype=DTYPE)
+    problem = Problem(robot, Unknowns(GaussianCoordinates(1, L, robot.rod.force_scale)), [Markers(S, p, 4e-4)])
+    found = analyze(problem, contact_hypotheses(problem), sampled=True)
+    assert found.intervals is not None and found.evidence is not None
+    truth, interval = rod.base_wrench[:, :3].norm(dim=-1), found.intervals.resultant[:, 3]
+    inside = (truth >= interval[:, 0]) & (truth <= interval[:, 1])
+    told = torch.tensor(["tip" in found.evidence.names[h] for h in found.evidence.choice.tolist()])
+    assert int(told.sum()) >= 10
+    assert float(inside[told].double().mean()) > 0.75 and float(inside.double().mean()) > 0.85

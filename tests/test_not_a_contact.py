@@ -59,6 +59,7 @@ def test_a_push_on_the_tip_in_any_direction_is_told_or_named():
     named = torch.tensor(["tip force" in a.message(b) for b in range(B)])
     assert float(inside.double().mean()) > 0.85
     assert float(told.double().mean()) > 0.55
+    assert float((interval[told, 0] > 0.3 * size[told]).double().mean()) > 0.8  # it counts that force
     assert bool((told | named | inside)[a.estimate.accepted].all())
     assert float((told | named).double().mean()) > 0.85
 
@@ -86,6 +87,26 @@ def test_loads_that_nobody_told_of_are_named_where_one_contact_explains_the_shap
     assert int(accepted["tip"].sum()) > 40 and float(said["tip"][accepted["tip"]].double().mean()) > 0.9
     assert int(accepted["two"].sum()) > 5 and float(said["two"][accepted["two"]].double().mean()) > 0.5
     assert accepted["one"].all() and int(said["one"].sum()) <= 2
+
+
+def test_where_nothing_or_one_contact_is_surely_right_no_force_at_the_tip_is_named():
+    """On an unloaded rod a contact near the tip, and a pull there, explain noise alike."""
+    p = tr.solve_shape(steel_rod(), (), None, S, 40, 80).p
+    a = analyze(problem := posed(S, noisy(p, 4e-4), 4e-4), contact_hypotheses(problem, 1), named=True)
+    near = (a.estimate.location > 0.3).any(-1) & a.estimate.accepted
+    assert int(near.sum()) >= 5 and not any("at the tip" in a.message(b) for b in range(40))
+
+
+def test_of_two_explanations_the_likelier_is_named():
+    """Of a force at the tip, where one contact more explains the shape better than one contact as well."""
+    random, B = torch.Generator().manual_seed(8), 60
+    way = torch.randn(B, 3, generator=random, dtype=torch.float64)
+    force = 0.5 * steel_rod().rod.force_scale * way / way.norm(dim=-1, keepdim=True)
+    wrench = tr.PointWrenches(force[:, None], 0 * force[:, None], T([0.4]))
+    problem = posed(S, noisy(tr.solve_shape(steel_rod(), (wrench,), None, S, B, 160).p, 4e-4), 4e-4)
+    a = analyze(problem, contact_hypotheses(problem, 1), named=True)
+    said = [a.message(b) for b in a.estimate.accepted.nonzero().flatten().tolist()]
+    assert len(said) > 30 and sum("N at the tip explains" in words for words in said) > 0.9 * len(said)
 
 
 @pytest.mark.study

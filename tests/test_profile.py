@@ -21,12 +21,15 @@ from torchrod import (
     Settings,
     SmoothCoordinates,
     Unknowns,
+    analyze,
+    contact_hypotheses,
     estimate,
     load_profile,
     shape_from_base,
     solve_shape,
 )
 from torchrod.cli import main
+from torchrod.cli.estimate import _drawn_rod
 from torchrod.estimation.load_profile import DRAWS, band_of_draws, joined_profile
 from torchrod.io import read_fit
 
@@ -191,3 +194,18 @@ def test_the_rod_that_is_drawn_is_the_one_that_was_fitted():
         drawn = fit.fitted_rod(0, load_profile(problem, fit.x, fit.covariance))
         shape = shape_from_base(robot, drawn.loads(0.4), drawn.base_wrench.unsqueeze(0), None, s, 80)
         assert (shape.p - fit.centre_line).abs().max() < 1e-3
+
+
+def test_the_whisker_is_the_interval_of_the_result():
+    """Of draws where there are any: once it was that of the covariance, a tenth as wide."""
+    robot = steel_rod()
+    s = torch.linspace(0.02, 0.4, 20)
+    p = solve_shape(robot, (PointForces(T([[[0.5, 0.2, 0.0]]]), T([[0.22]])),), None, s, 1, 80).p
+    problem = Problem(
+        robot, unknowns_of(robot), [Markers(s, p + 1e-3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(1)), 1e-3)]
+    )
+    found = analyze(problem, contact_hypotheses(problem, 1, "auto"), sampled=True)
+    drawn = _drawn_rod(found, 0).location_interval
+    assert drawn is not None and found.intervals is not None
+    assert torch.equal(drawn, found.intervals.location[0])
+    assert not torch.allclose(drawn, found.estimate.location_interval[0], rtol=1e-3)

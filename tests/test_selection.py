@@ -171,8 +171,8 @@ def test_without_draws_too_what_one_sample_chooses_does_not_depend_on_its_neighb
     random, B = torch.Generator().manual_seed(2), 8
     way = torch.randn(B, 3, generator=random, dtype=torch.float64)
     force = 0.5 * steel_rod().rod.force_scale * way / way.norm(dim=-1, keepdim=True)
-    p = markers_of((PointWrenches(force[:, None], 0 * force[:, None], T([0.4])),), B, 3).positions
-    noise = torch.tensor([[1e-3]] + [[5e-4]] * (B - 1)).expand(-1, len(S))  # of the first alone as it is
+    p = markers_of((PointWrenches(force[:, None], 0 * force[:, None], T([0.4])),), B, 3, 4e-4).positions
+    noise = torch.tensor([[4e-4]] + [[2e-4]] * (B - 1), dtype=torch.float64).expand(-1, len(S))  # of the first alone as it is
     problem = Problem(steel_rod(), unknowns_of(steel_rod()), [Markers(S, p, noise)])
     candidates = contact_hypotheses(problem)
     together = analyze(problem, candidates)
