@@ -11,11 +11,13 @@ from tests.robots import T, steel_rod
 from tests.test_edges import L as STRIP
 from tests.test_edges import strip
 from tests.test_tip import compressed
-from torchrod.estimation.chart import BUCKLES, GIVES_WAY, TWISTS, Chart, _log_size
-from torchrod.estimation.elsewhere import cheapest, fits_elsewhere
+from torchrod.estimation.chart import BUCKLES, FAINT, GIVES_WAY, TWISTS, Chart, _log_size, _Sized
+from torchrod.estimation.draws import _Target
+from torchrod.estimation.elsewhere import cheapest, fits_elsewhere, marks
+from torchrod.estimation.evaluator import evaluator
 from torchrod.estimation.proposal import Mixture, OnGrid, Proposal, Student
 from torchrod.estimation.solve import Settings, solver_of
-from torchrod.estimation.valley import line_of, valley
+from torchrod.estimation.valley import _Search, line_of, valley
 
 PLAIN = solver_of(Settings(restarts=(), basins=0))
 
@@ -47,6 +49,19 @@ def test_fits_along_a_valley_are_held_at_its_knots_and_explain_the_readings(kind
     at = found.x[..., line.entry]
     near = (at.unsqueeze(-1) - line.knots).abs().amin(-1)
     assert float((near < 5e-3)[found.sound].double().mean()) > 0.8  # all but the fit and those from elsewhere
+
+
+@pytest.mark.parametrize("kind", ["tip", "strip"])
+def test_the_cost_of_a_held_fit_is_that_of_the_problem_there(kind):
+    """Not of what holds it: priors at the knot, of a push and of its place."""
+    problem = compressed(4, 0.1, 0.55, 5)[0] if kind == "tip" else across(4)[0]
+    line, fit = line_of(problem), tr.estimate(problem)
+    assert line is not None
+    search = _Search(problem, line, PLAIN)
+    search.along(torch.arange(4), fit.x, search.nearest(fit.x))
+    assert len(search.of) > 20
+    plain = evaluator(problem.take(search.of), math.inf).cost(search.x)
+    assert float((search.cost - plain).abs().median()) < 0.02
 
 
 @pytest.mark.parametrize("kind", ["tip", "strip"])
@@ -207,3 +222,27 @@ def test_the_prior_of_a_push_across_a_strip_does_not_know_the_soft_side():
     p = chart.log_prior(y)[0]
     assert abs(float(p[1] - p[0])) < 0.15
     assert abs(float((p[3] - p[2]) - (p[1] - p[0]))) < 1e-9
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.05, 30.0])
+def test_a_prior_of_sizes_is_a_density_of_the_entries_in_whatever_unit(unit):
+    """Its integral over one entry, or two, is one."""
+    one = torch.cat([-(t := torch.logspace(-7, 3, 4001, dtype=torch.float64)).flip(0), t]) / unit
+    density = _Sized([0], 10.0, FAINT, unit=unit).log_prior(one.unsqueeze(-1)).exp()
+    assert math.isclose(float(torch.trapezoid(density, one)), 1.0, rel_tol=1e-3)
+    ring = torch.nn.functional.pad(t.unsqueeze(-1) / unit, (0, 1))  # of two, by the distance from zero
+    density = _Sized([0, 1], 10.0, FAINT, unit=unit).log_prior(ring).exp()
+    assert math.isclose(float(torch.trapezoid(2 * math.pi * ring[:, 0] * density, ring[:, 0])), 1.0, rel_tol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["tip", "strip"])
+def test_draws_start_from_the_nearest_fit_along_the_valley(kind):
+    problem = compressed(4, 0.1, 0.55, 5)[0] if kind == "tip" else across(4)[0]
+    fit = tr.estimate(problem)
+    target = _Target(problem, fit.x, fit.covariance, math.inf)
+    own, (B, S) = target.valley, target.valley.sound.shape
+    rows = torch.arange(B).repeat_interleave(S)
+    found = target._nearest(own.x.flatten(0, 1)[:, : target.chart.size], rows).unflatten(0, (B, S))
+    away = (marks(problem, own.x.gather(1, found.unsqueeze(-1).expand_as(own.x))) - marks(problem, own.x)).norm(dim=-1)
+    assert bool((away < 1e-9)[own.sound].all()) and bool(own.sound.gather(1, found).all())
+    assert len(found[own.sound].unique()) > 6
