@@ -54,7 +54,7 @@ def test_probabilities_are_those_of_the_evidence():
     for candidate in candidates:
         own = problem.of(candidate.unknowns)
         fit = selection(problem, [candidate]).fit
-        evidence.append(posterior_draws(own, fit).log_evidence + candidate.contacts * math.log(ONE_MORE))
+        evidence.append(posterior_draws(own, fit, prior="normalized").log_evidence + candidate.contacts * math.log(ONE_MORE))
     by_hand = torch.softmax(torch.stack(evidence, -1), -1)
     p = found.evidence.probability
     assert p is not None and torch.allclose(p, by_hand, atol=0.02)
@@ -71,7 +71,7 @@ def test_a_resultant_is_averaged_by_the_evidence_alone():
     R, weight, evidence = [], [], []
     for candidate in candidates:
         own = problem.of(candidate.unknowns)
-        draws = posterior_draws(own, selection(problem, [candidate]).fit)
+        draws = posterior_draws(own, selection(problem, [candidate]).fit, prior="normalized")
         R.append(resultant(own, draws.x))
         weight.append(draws.weight)
         evidence.append(draws.log_evidence)

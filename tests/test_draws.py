@@ -106,7 +106,7 @@ def test_evidence_and_intervals_where_the_number_of_pushes_is_chosen():
     evidence = []
     for count in range(3):
         own = problem.of(unknowns_of(robot, count))
-        evidence.append(tr.posterior_draws(own, tr.estimate(own), 128).log_evidence.nan_to_num(-1e9))
+        evidence.append(tr.posterior_draws(own, tr.estimate(own), 128, prior="normalized").log_evidence.nan_to_num(-1e9))
     assert torch.stack(evidence).argmax(0).tolist() == [0, 1, 2]
     found = tr.analyze(problem, tr.contact_hypotheses(problem), sampled=True)
     assert found.intervals is not None

@@ -68,8 +68,8 @@ def test_the_cost_of_a_held_fit_is_that_of_the_problem_there(kind):
 def test_draws_along_a_valley_are_of_their_sample_alone(kind):
     problem = compressed(3, 0.1, 1.2, 2)[0] if kind == "tip" else across(3)[0]
     fit, index = tr.estimate(problem), torch.tensor([1])
-    draws = tr.posterior_draws(problem, fit, 128)
-    alone = tr.posterior_draws(problem.take(index), fit.of(index, problem.size), 128)
+    draws = tr.posterior_draws(problem, fit, 128, prior="normalized")
+    alone = tr.posterior_draws(problem.take(index), fit.of(index, problem.size), 128, prior="normalized")
     counts = alone.weight[0] > 1e-6  # where Newton's steps go astray, it is a matter of round-off where to
     assert torch.allclose(alone.x[0][counts], draws.x[1][counts], rtol=1e-5, atol=1e-5)
     assert torch.allclose(alone.weight[0], draws.weight[1], atol=1e-5)
@@ -82,7 +82,7 @@ def test_a_few_draws_find_what_many_find(kind):
     """The evidence of 512 and of 2048: one fit's neighbourhood once had a third of what there is, or none of the truth's."""
     problem = compressed(10, 0.1, 0.55, 5)[0] if kind == "tip" else across(12)[0]
     fit = tr.estimate(problem)
-    few, many = (tr.posterior_draws(problem, fit, n) for n in (512, 2048))
+    few, many = (tr.posterior_draws(problem, fit, n, prior="normalized") for n in (512, 2048))
     off = (few.log_evidence - many.log_evidence).abs()
     assert float(off.median()) < 0.25 and float(off.quantile(0.8)) < 0.8
     assert float((few.k_hat > 0.7).double().mean()) < 0.15
@@ -155,24 +155,6 @@ def test_the_density_of_a_proposal_is_that_of_its_draws(which):
     assert torch.equal(p.take(torch.tensor([1])).draw(64, 7)[0], p.draw(64, 7)[1])
 
 
-@pytest.mark.parametrize("robot", [steel_rod(), strip(1e6)])
-@pytest.mark.parametrize("friction", [None, math.inf])
-def test_an_even_prior_in_place_of_the_other_is_that_of_the_fit(robot, friction):
-    """Of two pushes, whatever shares a size; places, widths and the tip keep theirs."""
-    L = robot.rod.length
-    s = torch.linspace(L / 20, L, 20)
-    loads = tr.GaussianCoordinates(2, L, robot.rod.force_scale, friction=friction)
-    problem = tr.Problem(robot, tr.Unknowns(loads), [tr.Markers(s, torch.nn.functional.pad(s.view(1, -1, 1), (2, 0)), 1e-3 * L)])
-    y = torch.randn(1, 9, problem.state.base.at.start, generator=torch.Generator().manual_seed(0))
-    chart = Chart(problem, torch.nn.functional.pad(y[:, 0], (0, 6)), None)
-    y[..., chart.places] = 0.0
-    even = chart.log_even(y)
-    assert even is not None
-    normal = -0.5 * (problem.precision[: y.shape[-1]] * (y - problem.mean[: y.shape[-1]]) ** 2).sum(-1)
-    off = chart.log_prior(y) + even - normal
-    assert torch.allclose(off, off[:, :1].expand_as(off), atol=1e-9)
-
-
 def test_fits_along_a_valley_have_their_loads_in_the_order_of_the_reported_ones():
     """Draws in another order are none: they are the same explanation twice."""
     problem = compressed(3, 0.1, 0.55, 5)[0]
@@ -239,7 +221,7 @@ def test_a_prior_of_sizes_is_a_density_of_the_entries_in_whatever_unit(unit):
 def test_draws_start_from_the_nearest_fit_along_the_valley(kind):
     problem = compressed(4, 0.1, 0.55, 5)[0] if kind == "tip" else across(4)[0]
     fit = tr.estimate(problem)
-    target = _Target(problem, fit.x, fit.covariance, math.inf)
+    target = _Target(problem, fit.x, fit.covariance, math.inf, True)
     own, (B, S) = target.valley, target.valley.sound.shape
     rows = torch.arange(B).repeat_interleave(S)
     found = target._nearest(own.x.flatten(0, 1)[:, : target.chart.size], rows).unflatten(0, (B, S))

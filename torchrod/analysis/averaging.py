@@ -4,7 +4,8 @@ The marginal likelihood of a hypothesis is the mean weight of the draws of its p
 normalized. Probabilities p_h, by which loads are reported, are in its proportion, times ONE_MORE for each load and UNTOLD for a
 force at the tip that nobody told of; a smooth load is reported where no other explains the readings. The resultant, and f(s) along
 the rod, which all of them have, are of draws of all of them, weighted by the marginal likelihood alone: a load that is not reported
-may be there, and must not be left out of an interval.
+may be there, and must not be left out of an interval. Intervals of the loads that are reported are of draws of their own, by
+Jeffreys' prior.
 Source: Hoeting et al., Statistical Science 14 (1999) 382.
 """
 
@@ -92,7 +93,7 @@ def average(
             for d in drawn:
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
-                    collected.put(chunk[d.rows[chosen]], intervals(d.draws.take(chosen), d.spare))
+                    collected.put(chunk[d.rows[chosen]], intervals(_for_intervals(d, chosen, nu), d.spare))
             shares = _probabilities(drawn, scores[chunk])
             _mix(collected, chunk, drawn, shares, kinds)
             _mix_forms(collected, chunk, drawn, shares, choice[chunk], forms)
@@ -164,8 +165,15 @@ def _drawn(
         rows = wanted.nonzero().squeeze(-1)
         if len(rows):
             part = fit.of(place[rows], own.size)
-            drawn.append(_Drawn(h, rows, part, posterior_draws(own.take(chunk[rows]), part, nu=nu), spare))
+            draws = posterior_draws(own.take(chunk[rows]), part, nu=nu, prior="normalized")
+            drawn.append(_Drawn(h, rows, part, draws, spare))
     return drawn
+
+
+def _for_intervals(d: _Drawn, which: Int[Tensor, " c"], nu: float) -> Draws:
+    """Of some of its samples, by Jeffreys' prior where that makes a difference."""
+    part = d.draws.take(which)
+    return posterior_draws(part.problem, d.fit.of(which, part.problem.size), nu=nu) if part.has_pushes else part
 
 
 def _probabilities(

@@ -12,17 +12,18 @@ forces, and for an entry xi that stands for one (load_families.family, along_rod
 drawn in their own entries. The base wrench is no entry of v: equilibrium gives it.
 
 The fit needs weak priors that are normal in its own entries, of which draws must make sense where the data say little: normal with
-a deviation of 10 in eta puts nine tenths of all pushes within a tenth of the ends. Before the data, draws take a push to be
-anywhere along the rod with the same probability, and of any size,
+a deviation of 10 in eta puts nine tenths of all pushes within a tenth of the ends. For intervals, pushes at unknown places have
+Jeffreys' prior (estimation.jeffreys). That tells no evidence, for which they may be anywhere along the rod with the same
+probability, and of any size,
 
     (2)  p(eta) = r (1 - r),    p(F) = exp(-|F|^2 / 2 w^2) / (f^2 + |F|^2)^(d/2) / Z
 
 even in log |F| between the least force worth telling (f = FAINT) and the fit's own weak prior (w), F being the d components of all
 loads together: normal forces whose common size may be any. Of loads one by one, the prior would take one of two close pushes to be
 next to nothing. The unknown force and the moment at the tip have (2) each for itself, across the base's axis and along it, and so
-has a strip's soft side, and what pushes across it. What only weighs on what bends the rod already is even up to where it bends the
-rod by itself (f = BUCKLES, TWISTS, GIVES_WAY): smaller amounts are as hard to see as none, and no likelier. Widths, tensions and
-the base frame's error keep their priors, and so does all that a problem has a prior of its own for.
+has, for the evidence, a strip's soft side, and always what pushes across it. What only weighs on what bends the rod already is even
+up to where it bends the rod by itself (f = BUCKLES, TWISTS, GIVES_WAY): smaller amounts are as hard to see as none, and no
+likelier. Widths, tensions and the base frame's error keep their priors, and so does all that a problem has a prior of its own for.
 """
 
 import math
@@ -41,6 +42,7 @@ from ..util.precision import DTYPE
 from . import filter as ekf
 from .elsewhere import across_strip
 from .evaluator import evaluator
+from .jeffreys import Information
 
 PLACES = 24  # along the rod, at which a force is tried
 CELLS = 96  # between which the response is linear
@@ -70,7 +72,8 @@ def _log_size(F: Float[Tensor, "... d"], weak: float, faint: float) -> Float[Ten
 @dataclass(frozen=True)
 class _Sized:
     """Entries that share a size by (2): with the deviation of their weak prior, and what is faint, in force or moment scales. axis:
-    of lateral forces, only what is along it in the section. unit: of the entries, in scales.
+    of lateral forces, only what is along it in the section. unit: of the entries, in scales. push: they are forces of loads that
+    Jeffreys' prior is of.
     """
 
     at: list[int]
@@ -78,6 +81,7 @@ class _Sized:
     faint: float
     axis: Float[Tensor, " 2"] | None = None
     unit: float = 1.0
+    push: bool = False
 
     def of(self, y: Float[Tensor, "... m"]) -> Float[Tensor, "... d"]:
         """What has that size, in scales."""
@@ -111,7 +115,7 @@ class Response:
 
     A force has d = 2 components, or 3. gram (B, C, C, d d): H^T W H of a force at one place and one at another, row by row; cross
     (B, C, d q): with u; own (B, q, q): of u, with its prior. pull (B, C, d), pull_u (B, q): H^T W (z - h) as if there were no
-    force and u were at the fit.
+    force and u were at the fit. information: for Jeffreys' prior, where that is asked for.
     """
 
     gram: Float[Tensor, "B CC d2"]
@@ -119,10 +123,12 @@ class Response:
     own: Float[Tensor, "B q q"]
     pull: Float[Tensor, "B C d"]
     pull_u: Float[Tensor, "B q"]
+    information: Information | None
 
     def take(self, index: Int[Tensor, " b"]) -> "Response":
         """The samples of an index."""
-        return Response(self.gram[index], self.cross[index], self.own[index], self.pull[index], self.pull_u[index])
+        information = None if self.information is None else self.information.take(index)
+        return Response(self.gram[index], self.cross[index], self.own[index], self.pull[index], self.pull_u[index], information)
 
 
 def _cells(at: Float[Tensor, "..."], count: int) -> tuple[Int[Tensor, "... 2"], Float[Tensor, "... 2"]]:
@@ -146,7 +152,9 @@ def _halves(mu: Float[Tensor, "..."], width: Float[Tensor, "..."]) -> Float[Tens
     return torch.stack([mean - std, mean + std], -1).clamp(0, 1)
 
 
-def _response(problem: Problem, x: Float[Tensor, "B n"], at: Float[Tensor, "B K"], force: Float[Tensor, "B K d"]) -> Response:
+def _response(
+    problem: Problem, x: Float[Tensor, "B n"], at: Float[Tensor, "B K"], force: Float[Tensor, "B K d"], informed: bool
+) -> Response:
     """At the fits x, whose loads are at s / L and have these forces (in force scales): each is shared between two point forces,
     which bend the rod as it does, and then the model is linear in point forces all along the rod.
     """
@@ -169,7 +177,8 @@ def _response(problem: Problem, x: Float[Tensor, "B n"], at: Float[Tensor, "B K"
     gram = torch.einsum("ci,bixjy,dj->bcdxy", U, A[:, :J, :J].reshape(B, PLACES, d, PLACES, d), U)
     cross = torch.einsum("ci,bixq->bcxq", U, A[:, :J, J:].reshape(B, PLACES, d, q))
     asked = torch.einsum("ci,bix->bcx", U, pull[:, :J].reshape(B, PLACES, d))
-    return Response(gram.flatten(1, 2).flatten(-2), cross.flatten(-2), own, asked, pull_u)
+    information = Information.of(A, own, d) if informed else None
+    return Response(gram.flatten(1, 2).flatten(-2), cross.flatten(-2), own, asked, pull_u, information)
 
 
 @dataclass(frozen=True)
@@ -181,14 +190,15 @@ class Chart:
     response: Response | None
 
     @classmethod
-    def at(cls, problem: Problem, x: Float[Tensor, "B n"]) -> "Chart":
-        """About the fits x."""
+    def at(cls, problem: Problem, x: Float[Tensor, "B n"], jeffreys: bool = False) -> "Chart":
+        """About the fits x. jeffreys: the prior of pushes is Jeffreys', not (2)."""
         bare = cls(problem, x, None)
         K = len(bare.places)
         if not K:
             return bare
         force = bare._with_forces(x)[:, bare.linear[: bare.components * K]]
-        return cls(problem, x, _response(problem, x, torch.sigmoid(x[:, bare.places]), force.unflatten(-1, (K, -1))))
+        at, informed = torch.sigmoid(x[:, bare.places]), jeffreys and bare.has_pushes
+        return cls(problem, x, _response(problem, x, at, force.unflatten(-1, (K, -1)), informed))
 
     def take(self, index: Int[Tensor, " b"]) -> "Chart":
         """The samples of an index."""
@@ -356,10 +366,11 @@ class Chart:
             sides, across = self.problem.robot.rod.sides, across_strip(self.problem.robot.rod)
             if across is None or loads.friction == math.inf:
                 along = self.along if loads.friction == math.inf else []
-                found.append(_Sized(lateral + along, WEAK_STD, FAINT * min(1.0, *sides)))
+                found.append(_Sized(lateral + along, WEAK_STD, FAINT * min(1.0, *sides), push=True))
             else:
                 soft = torch.stack([across[1], -across[0]])
-                found += [_Sized(lateral, WEAK_STD, FAINT * min(sides), soft), _Sized(lateral, WEAK_STD, GIVES_WAY, across)]
+                found.append(_Sized(lateral, WEAK_STD, FAINT * min(sides), soft, push=True))
+                found.append(_Sized(lateral, WEAK_STD, GIVES_WAY, across))
         tip, rod = self.problem.state.tip, self.problem.robot.rod
         for first in range(tip.at.start, tip.at.stop, 3):  # across the base's axis, and along it
             turns = first > tip.at.start
@@ -368,19 +379,24 @@ class Chart:
             found += [_Sized([first, first + 1], TIP_STD, FAINT, unit=unit), _Sized([first + 2], *along, unit=unit)]
         return found
 
-    def log_even(self, y: Float[Tensor, "B D m"]) -> Float[Tensor, "B D"] | None:
-        """log of the prior that is even in the forces of pushes, which is the fit's own, over (2), but for a constant.
+    @cached_property
+    def _pushes(self) -> _Sized | None:
+        """Those at unknown places whose prior, for intervals, is Jeffreys'."""
+        return next((sized for sized in self._scale_free if sized.push), None) if self.places else None
 
-        None unless there are two pushes of any size or more. Where two nearly cancel, the readings tell the couple they make, and
-        (2) takes small forces far apart to be likelier than large ones side by side: the fourth power of their distance.
-        """
-        loads = self.problem.state.loads.at
-        pushes = [sized for sized in self._scale_free if sized.at[0] < loads.stop]
-        if len(self.places) < 2 or not pushes:
-            return None
-        even = sum(-0.5 * sized.of(y).square().sum(-1) / sized.weak**2 - sized.log_prior(y) for sized in pushes)
-        assert isinstance(even, Tensor)
-        return even
+    @property
+    def has_pushes(self) -> bool:
+        """Whether there are loads that Jeffreys' prior is of."""
+        return self._pushes is not None
+
+    def _log_jeffreys(self, y: Float[Tensor, "B D m"], information: Information) -> Float[Tensor, "B D"]:
+        """log of Jeffreys' prior of pushes and their places, within the fit's weak prior of forces."""
+        pushes, K, d = self._pushes, len(self.places), self.components
+        assert pushes is not None
+        F = self._with_forces(y)[..., self.linear[: d * K]].unflatten(-1, (K, d))
+        ways = torch.eye(d, dtype=DTYPE)[: len(pushes.at) // K] if pushes.axis is None else pushes.axis.unsqueeze(0)
+        weak = -0.5 * pushes.of(y).square().sum(-1) / pushes.weak**2
+        return information.log_root(y[..., self.places], F, ways) + weak
 
     def fitted_prior(self, x: Float[Tensor, "B D n"]) -> Float[Tensor, "B D"]:
         """What the fit's cost holds of its own prior."""
@@ -388,15 +404,20 @@ class Chart:
         return (precision * (x - mean) ** 2).sum(-1)
 
     def log_prior(self, y: Float[Tensor, "B D m"]) -> Float[Tensor, "B D"]:
-        """log p(y), normalized but for entries without a prior."""
+        """log p(y), normalized but for entries without a prior, and Jeffreys'."""
         m, total = self.size, y.new_zeros(y.shape[:-1])
         mean, precision = ((v.unsqueeze(1) if v.ndim > 1 else v)[..., :m] for v in (self.problem.mean, self.problem.precision))
         normal = torch.ones(m, dtype=torch.bool)
+        information = None if self.response is None else self.response.information
         for sized in self._scale_free:
-            total = total + sized.log_prior(y)
+            if information is None or sized is not self._pushes:
+                total = total + sized.log_prior(y)
+            else:
+                total = total + self._log_jeffreys(y, information)
             normal[sized.at] = False
         for i in self.places if self.problem.prior is None else ():
-            total = total + torch.nn.functional.logsigmoid(y[..., i]) + torch.nn.functional.logsigmoid(-y[..., i])
+            if information is None:
+                total = total + torch.nn.functional.logsigmoid(y[..., i]) + torch.nn.functional.logsigmoid(-y[..., i])
             normal[i] = False
         log_density = 0.5 * (torch.log(precision.clamp(min=1e-300) / (2 * math.pi)) - precision * (y - mean) ** 2)
         return total + torch.where(precision > 0, log_density, 0.0)[..., normal].sum(-1)

@@ -19,6 +19,7 @@ import itertools
 import math
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -64,6 +65,7 @@ FINE = 2.5e-4  # of the length: markers less exact than that cannot tell COARSE_
 CLAMPED, LEAST_CLAMPED = 0.01, 1e-9  # by how much the base may miss its clamp: of the noise at the tip, rad
 NEWTON = 6
 SETTLED = 1.0  # of the tip's cost: from there one more Newton step is exact to second order
+Prior = Literal["jeffreys", "normalized"]  # of pushes at unknown places
 
 
 class Method(IntEnum):
@@ -86,8 +88,8 @@ class Draws:
 
     x (B, D, n), weight (B, D), which sum to 1. k_hat (B,): Pareto's shape of the weights; above 0.7 they are not to be trusted.
     ess (B,): to how many independent draws they amount. log_evidence (B,): log of the mean unnormalized weight, the marginal
-    likelihood of the unknowns up to what all of a sample's hypotheses share: the larger, the better they explain it. method
-    (B,): Method codes. NaN throughout where the fit has not converged.
+    likelihood of the unknowns up to what all of a sample's hypotheses share: the larger, the better they explain it; NaN by
+    Jeffreys' prior, which tells none. method (B,): Method codes. NaN throughout where the fit has not converged.
     """
 
     problem: Problem = field(repr=False)
@@ -97,6 +99,11 @@ class Draws:
     ess: Float[Tensor, " B"]
     log_evidence: Float[Tensor, " B"]
     method: Int[Tensor, " B"]
+
+    @property
+    def has_pushes(self) -> bool:
+        """Whether Jeffreys' prior is another than the normalized one."""
+        return Chart(self.problem, self.x[:, 0], None).has_pushes
 
     def take(self, index: Int[Tensor, " b"]) -> "Draws":
         """The samples of an index."""
@@ -116,10 +123,10 @@ def _exactly(problem: Problem) -> Problem:
 class _Target:
     """log pi of draws of the samples of a problem."""
 
-    def __init__(self, problem: Problem, x: Float[Tensor, "B n"], C: Float[Tensor, "B n n"], nu: float):
+    def __init__(self, problem: Problem, x: Float[Tensor, "B n"], C: Float[Tensor, "B n n"], nu: float, jeffreys: bool):
         self.problem, self.nu, self.x = _exactly(problem), nu, x
         self.valley = valley(self.problem, x, C, solver_of(PLAIN))
-        self.chart = Chart.at(self.problem, x)
+        self.chart = Chart.at(self.problem, x, jeffreys)
         m = self.chart.size
         each = self.valley.C.flatten(0, 1)
         follow = ekf.solve_spd(each[:, :m, :m], each[:, :m, m:]).mT if m else each.new_zeros(len(each), TIP_ROWS, 0)
@@ -526,23 +533,25 @@ def _less_at_the_tip(
     return found
 
 
-def _drawn(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int) -> _Found:
+def _drawn(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int, jeffreys: bool) -> _Found:
     """Draws about the fits x with covariances C, which hold other fits as well where there are such."""
     if elsewhere(problem) is not None:
         evaluate = evaluator(problem, nu)
         own, _ = evaluate.posterior(evaluate.sums(x), x)
         C = torch.where(torch.isfinite(own).flatten(1).all(-1)[:, None, None], own, C)
-    target = _Target(problem, x, C, nu)
+    target = _Target(problem, x, C, nu, jeffreys)
     return _importance(target, _about(target, C, draws), draws)
 
 
-def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int) -> _Found:
+def _about_all_fits(
+    problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, "b n n"], nu: float, draws: int, jeffreys: bool
+) -> _Found:
     """The same about all fits of samples that have several (estimation.elsewhere), each by the evidence of what was drawn about it.
 
     The equilibria about one fit are no branch of those about another: what is drawn about the one hardly finds the other. Where
     it does, a fit has its draws twice; the evidence counts of each run what is nearest to its own fit.
     """
-    found = _drawn(problem, x, C, nu, draws)
+    found = _drawn(problem, x, C, nu, draws, jeffreys)
     others = fits_elsewhere(problem, x, solver_of(Settings(restarts=(), basins=0, sized=False)))
     if others is None:
         return found
@@ -554,7 +563,7 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
         own = fit.of((turn == k).nonzero().squeeze(-1), problem.size)
         run = found.take(torch.arange(len(x)))
         run.log_weight[:], run.log_evidence[:] = -math.inf, -math.inf  # of samples without another fit
-        run.put(rows, _drawn(problem.take(rows), own.x, own.covariance, nu, draws))
+        run.put(rows, _drawn(problem.take(rows), own.x, own.covariance, nu, draws, jeffreys))
         runs.append(run)
         centres.append(torch.full_like(centres[0], torch.inf).index_copy(0, rows, marks(problem, own.x)))
     evidence = torch.stack([run.log_evidence.nan_to_num(-math.inf) for run in runs], 1)
@@ -581,12 +590,16 @@ def _about_all_fits(problem: Problem, x: Float[Tensor, "b n"], C: Float[Tensor, 
     return found
 
 
-def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu: float = math.inf) -> Draws:
+def posterior_draws(
+    problem: Problem, estimate: Estimate, draws: int = DRAWS, nu: float = math.inf, prior: Prior = "jeffreys"
+) -> Draws:
     """Draws of the posterior of x of every sample that has converged: see the module.
 
     problem: the one that was fitted. estimate: its fit. draws: how many of each sample, a power of two, at least FEWEST. nu:
-    degrees of freedom of Student's t of a robust fit. Costs 10 us a draw for a rod without weight, 30 to 100 for other robots
-    (docs/coverage.md). Errors: ValueError for an estimate of other unknowns, or fewer draws. Source: Vehtari et al., JMLR 2024.
+    degrees of freedom of Student's t of a robust fit. prior: of pushes at unknown places, Jeffreys' (estimation.jeffreys), by which
+    intervals hold the truth as often as they say, or the normalized (2) of estimation.chart, which tells the evidence. Costs 10 us
+    a draw for a rod without weight, 30 to 100 for other robots (docs/coverage.md). Errors: ValueError for an estimate of other
+    unknowns, or fewer draws. Source: Vehtari et al., JMLR 2024.
     """
     n, B = problem.size, problem.batch
     if draws < FEWEST:
@@ -609,10 +622,12 @@ def posterior_draws(problem: Problem, estimate: Estimate, draws: int = DRAWS, nu
                 continue
             part = replace(problem.take(rows)) if len(rows) == B else problem.take(rows)
             drawn = _drawn if elsewhere(part) is None or line_of(part) is not None else _about_all_fits
-            found = drawn(part, estimate.x[rows], estimate.covariance[rows], nu, draws)
+            found = drawn(part, estimate.x[rows], estimate.covariance[rows], nu, draws, prior == "jeffreys")
             x[rows], weight[rows] = found.x, found.log_weight.exp()
-            loads = len(Chart(part, found.x[:, 0], None).places)
-            alike = math.lgamma(loads + 1)  # as many orders of the loads, of which the draws have one
+            chart = Chart(part, found.x[:, 0], None)
+            alike = math.lgamma(len(chart.places) + 1)  # as many orders of the loads, of which the draws have one
+            if prior == "jeffreys" and chart.has_pushes:
+                alike = math.nan
             k_hat[rows], ess[rows], evidence[rows] = found.k_hat, found.ess, found.log_evidence + alike
             method[rows] = found.method
     return Draws(problem, x, weight, k_hat, ess, evidence, method)

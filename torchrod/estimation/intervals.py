@@ -9,15 +9,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..model.load_families.family import LoadReport
 from ..model.problem import Problem
 from ..model.unknowns import Unknowns
 from ..util.precision import DTYPE
-from .chart import Chart
 from .draws import DRAWS, Draws, Method, picked, posterior_draws, systematic
 from .load_profile import DRAWS as OF_BAND
 from .load_profile import LEVELS, NODES, band_of_draws
-from .pareto import smoothed
 from .result import Z95, Estimate
 
 FLAT = 0.3  # times EI: how stiff the soft side of a flat rod is at most
@@ -101,44 +98,21 @@ def resultant(problem: Problem, x: Float[Tensor, "B D n"], with_tip: bool = Fals
 
 
 def intervals(draws: Draws, with_tip: bool = False) -> Intervals:
-    """The intervals of draws; those of force and place of several pushes hold what an even prior of the forces has as well.
-
-    with_tip: the resultant counts an unknown force at the tip.
-    Which of two priors of ignorance is meant, even in the logarithm of the forces' size or in the forces, nobody has said, and of
-    pushes that nearly cancel it decides how large they are and how far apart (Chart.log_even).
-    """
+    """The intervals of draws. with_tip: the resultant counts an unknown force at the tip."""
     problem, x, weight = draws.problem, draws.x, draws.weight
-    family, state, chart = problem.unknowns.loads, problem.state, Chart(problem, x[:, 0], None)
+    family, state = problem.unknowns.loads, problem.state
     gamma = x[..., state.loads.at]
     report, R = family.describe(gamma), resultant(problem, x, with_tip)
-    size, place, force = _of_loads(problem, report, weight)
-    even = chart.log_even(x[..., : chart.size])
-    if even is not None:
-        log_weight, _ = smoothed((weight.log() + even).nan_to_num(-1e9, neginf=-1e9))
-        # Where the two priors contradict each other few draws count here. They explain the readings all the same.
-        other = _of_loads(problem, report, log_weight.exp())
-        size, place, force = (either(own, more) for own, more in zip((size, place, force), other, strict=True))
-    whole = torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight, _flat(problem))], 1)
+    flat, K = min(problem.robot.rod.sides) < FLAT, report.location.shape[-1]
+    place, force = quantiles(torch.cat([report.location, report.force.flatten(-2)], -1), weight).split([K, 2 * K], 1)
+    size, force = of_sizes(report.force, weight, flat), force.unflatten(1, (K, 2))
+    whole = torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight, flat)], 1)
     drag = None if report.axial is None else quantiles(report.axial, weight)
     tip = quantiles(state.tip_wrench(x), weight) if state.tip.size else None
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
     band = band_of_draws(family, picked(gamma, systematic(weight, OF_BAND)), s)
     made = Intervals(size, place, force, drag, whole, tip, band, draws.k_hat, draws.ess, draws.method)
     return _masked(made, draws.k_hat <= 1)
-
-
-def _of_loads(
-    problem: Problem, report: LoadReport, weight: Float[Tensor, "B D"]
-) -> tuple[Float[Tensor, "B K 2"], Float[Tensor, "B K 2"], Float[Tensor, "B K 2 2"]]:
-    """Of size, place and force of every load, by the weights of the draws."""
-    K = report.location.shape[-1]
-    place, force = quantiles(torch.cat([report.location, report.force.flatten(-2)], -1), weight).split([K, 2 * K], 1)
-    return of_sizes(report.force, weight, _flat(problem)), place, force.unflatten(1, (K, 2))
-
-
-def _flat(problem: Problem) -> bool:
-    """Whether the rod is, for of_sizes."""
-    return min(problem.robot.rod.sides) < FLAT
 
 
 def either(a: Float[Tensor, "*n 2"], b: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
