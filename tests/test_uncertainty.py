@@ -494,7 +494,7 @@ def test_draws_where_it_is_unknown_whether_tendons_rub():
     p = solve_shape(robot, (load,), T([[6.0, 3.0]]), S, 1).p
     problem = Problem(robot, unknowns_of(robot, uncertainty=Uncertainty(friction=0.1)), [Markers(S, p, 4e-4)], T([[6.0, 3.0]]))
     fit = estimate(problem)
-    found = intervals(posterior_draws(problem, fit))
+    found = intervals(posterior_draws(problem, fit), fit)
     low, high = found.location[0, 0].tolist()
     assert low < 0.25 < high and high - low < 8 * float(fit.location_std)
 

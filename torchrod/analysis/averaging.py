@@ -93,7 +93,8 @@ def average(
             for d in drawn:
                 chosen = (choice[chunk[d.rows]] == d.h).nonzero().squeeze(-1)
                 if len(chosen):
-                    collected.put(chunk[d.rows[chosen]], intervals(_for_intervals(d, chosen, nu), d.spare))
+                    part = d.fit.of(chosen, problems[d.h].size)
+                    collected.put(chunk[d.rows[chosen]], intervals(_for_intervals(d, chosen, part, nu), part, d.spare))
             shares = _probabilities(drawn, scores[chunk])
             _mix(collected, chunk, drawn, shares, kinds)
             _mix_forms(collected, chunk, drawn, shares, choice[chunk], forms)
@@ -170,10 +171,10 @@ def _drawn(
     return drawn
 
 
-def _for_intervals(d: _Drawn, which: Int[Tensor, " c"], nu: float) -> Draws:
-    """Of some of its samples, by Jeffreys' prior where that makes a difference."""
-    part = d.draws.take(which)
-    return posterior_draws(part.problem, d.fit.of(which, part.problem.size), nu=nu) if part.has_pushes else part
+def _for_intervals(d: _Drawn, which: Int[Tensor, " c"], fit: Estimate, nu: float) -> Draws:
+    """Of some of its samples and their fit, by Jeffreys' prior where that makes a difference."""
+    draws = d.draws.take(which)
+    return posterior_draws(draws.problem, fit, nu=nu) if draws.has_pushes else draws
 
 
 def _probabilities(

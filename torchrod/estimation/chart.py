@@ -23,7 +23,9 @@ loads together: normal forces whose common size may be any. Of loads one by one,
 next to nothing. The unknown force and the moment at the tip have (2) each for itself, across the base's axis and along it, and so
 has, for the evidence, a strip's soft side, and always what pushes across it. What only weighs on what bends the rod already is even
 up to where it bends the rod by itself (f = BUCKLES, TWISTS, GIVES_WAY): smaller amounts are as hard to see as none, and no
-likelier. Widths, tensions and the base frame's error keep their priors, and so does all that a problem has a prior of its own for.
+likelier. So is a wrench at the tip where nothing else is unknown (f = FAINT_WRENCH): its force and its moment bend the rod much
+alike, and of the two the prior would take one to be next to nothing. Widths, tensions and the base frame's error keep their priors,
+and so does all that a problem has a prior of its own for.
 """
 
 import math
@@ -48,6 +50,7 @@ PLACES = 24  # along the rod, at which a force is tried
 CELLS = 96  # between which the response is linear
 FAINT = 0.01  # in force and moment scales: what is weaker might as well be nothing
 BUCKLES = math.pi**2 / 16  # force scales: what is weaker along the rod only weighs on what bends it already
+FAINT_WRENCH = 0.1  # where force and moment at the tip trade, and nothing else is unknown
 TWISTS = 2.2  # moment scales, in the same way: 4.49 EI / L twist a straight rod off its axis
 GIVES_WAY = 1.0  # force scales, of a push across a strip, in the same way
 STEP = 1e-3  # of the differences in dv/dy
@@ -372,11 +375,12 @@ class Chart:
                 found.append(_Sized(lateral, WEAK_STD, FAINT * min(sides), soft, push=True))
                 found.append(_Sized(lateral, WEAK_STD, GIVES_WAY, across))
         tip, rod = self.problem.state.tip, self.problem.robot.rod
+        faint = FAINT_WRENCH if tip.size == 6 and not self.problem.state.loads.size else FAINT
         for first in range(tip.at.start, tip.at.stop, 3):  # across the base's axis, and along it
             turns = first > tip.at.start
             along = (TORQUE_STD, TWISTS) if turns else (TIP_STD, BUCKLES)
             unit = float(tip.unit[first - tip.at.start]) / (rod.moment_scale if turns else rod.force_scale)
-            found += [_Sized([first, first + 1], TIP_STD, FAINT, unit=unit), _Sized([first + 2], *along, unit=unit)]
+            found += [_Sized([first, first + 1], TIP_STD, faint, unit=unit), _Sized([first + 2], *along, unit=unit)]
         return found
 
     @cached_property

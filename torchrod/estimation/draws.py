@@ -445,7 +445,7 @@ def _about(target: _Target, C: Float[Tensor, "b n n"], count: int) -> list[tuple
         Student.of(chart.to(centre.unsqueeze(1)).squeeze(1), J @ own @ J.mT) for centre, own in _less_at_the_tip(target, y, C_y)
     ]
     if chart.response is None:
-        return _sharing([Student.of(near, C)], less, count)
+        return _with_valley(target, _sharing([Student.of(near, C)], less, count))
     at, others = torch.tensor(chart.places), torch.tensor([i for i in range(m) if i not in chart.places])
     C_at, C_both = C[:, at][:, :, at], C[:, others][:, :, at]
     follow = ekf.solve_spd(C_at, C_both.mT).mT.nan_to_num(0.0)
@@ -497,7 +497,7 @@ def _with_valley(target: _Target, first: list[tuple[Proposal, int]]) -> list[tup
 
 def _no_wider(chart: Chart, C: Float[Tensor, "b m m"]) -> Float[Tensor, "b m m"]:
     """The covariance with places no less sure than WIDEST."""
-    at = torch.tensor(chart.places)
+    at = torch.tensor(chart.places, dtype=torch.int64)
     shrink = C.new_ones(C.shape[:2])
     shrink[:, at] = (WIDEST / C.diagonal(dim1=-2, dim2=-1)[:, at].sqrt()).clamp(max=1.0)
     return C * shrink.unsqueeze(-1) * shrink.unsqueeze(-2)

@@ -119,10 +119,14 @@ def _pushes(problem: Problem, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, 
 
 def _tip_force(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 3"]:
     """In force scales."""
-    tip = problem.state.tip
-    if not tip.size:
-        return x[..., :0]
-    return x[..., tip.at.start : tip.at.start + 3] * (tip.unit[:3] / problem.robot.rod.force_scale)
+    return _tip_wrench(problem, x)[..., :3]
+
+
+def _tip_wrench(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... q"]:
+    """What is unknown of it, in force and moment scales."""
+    tip, rod = problem.state.tip, problem.robot.rod
+    scale = x.new_tensor([rod.force_scale] * 3 + [rod.moment_scale] * 3)[: tip.size]
+    return x[..., tip.at] * (tip.unit / scale)
 
 
 def _wrench(problem: Problem, shape: Shape, x: Float[Tensor, "B n"]) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
@@ -147,12 +151,12 @@ def _held(problem: Problem, shape: Shape, start: Float[Tensor, "B n"], x: Float[
 
 
 def marks(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... c"]:
-    """By what fits differ: the places of the pushes (lengths), the force at the tip and, on a strip, what pushes across it (force
-    scales).
+    """By what fits differ: the places of the pushes (lengths), what is unknown at the tip and, on a strip, what pushes across it
+    (force and moment scales).
     """
     force, place = _pushes(problem, x)
     across = across_strip(problem.robot.rod)
-    return torch.cat([place, _tip_force(problem, x), *(() if across is None else (force @ across,))], -1)
+    return torch.cat([place, _tip_wrench(problem, x), *(() if across is None else (force @ across,))], -1)
 
 
 def _beside_the_tip(problem: Problem, x: Float[Tensor, "B n"]) -> list[Float[Tensor, "B n"]]:

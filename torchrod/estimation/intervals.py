@@ -26,7 +26,7 @@ CHUNK = 64  # samples at a time: their draws are not kept
 @dataclass(frozen=True)
 class Intervals:
     """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1). Where the
-    first proposal did not do (method), those of loads and tip take in the normal ones.
+    first proposal did not do (method), those of loads, resultant and tip take in the normal ones.
 
     magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
     along the rod, or None. resultant (B, 4, 2) N: of the three components, in the base frame, and the size of all that pushes
@@ -97,8 +97,24 @@ def resultant(problem: Problem, x: Float[Tensor, "B D n"], with_tip: bool = Fals
     return loads if with_tip else loads - problem.state.tip_wrench(x)[..., :3]
 
 
-def intervals(draws: Draws, with_tip: bool = False) -> Intervals:
-    """The intervals of draws. with_tip: the resultant counts an unknown force at the tip."""
+def _normal_resultant(problem: Problem, fit: Estimate, with_tip: bool) -> Float[Tensor, "B 4 2"]:
+    """By the covariance of a fit."""
+    base, tip, J = problem.state.base, problem.state.tip, fit.x.new_zeros(3, problem.size)
+    J[:, base.at.start : base.at.start + 3] = base.unit[:3].diag()
+    if tip.size and not with_tip:
+        J[:, tip.at.start : tip.at.start + 3] = -tip.unit[:3].diag()
+    R, C = resultant(problem, fit.x.unsqueeze(1), with_tip).squeeze(1), J @ fit.covariance @ J.mT
+    size = R.norm(dim=-1, keepdim=True)
+    way = R / size.clamp(min=1e-300)
+    along = (way * (C @ way.unsqueeze(-1)).squeeze(-1)).sum(-1, keepdim=True)
+    std = torch.cat([C.diagonal(dim1=-2, dim2=-1), along], -1).clamp(min=0).sqrt()
+    low, high = (torch.cat([R, size], -1) + sign * Z95 * std for sign in (-1.0, 1.0))
+    low[:, 3] = low[:, 3].clamp(min=0.0)
+    return torch.stack([low, high], -1)
+
+
+def intervals(draws: Draws, fit: Estimate, with_tip: bool = False) -> Intervals:
+    """The intervals of draws of the posterior about a fit. with_tip: the resultant counts an unknown force at the tip."""
     problem, x, weight = draws.problem, draws.x, draws.weight
     family, state = problem.unknowns.loads, problem.state
     gamma = x[..., state.loads.at]
@@ -107,6 +123,8 @@ def intervals(draws: Draws, with_tip: bool = False) -> Intervals:
     place, force = quantiles(torch.cat([report.location, report.force.flatten(-2)], -1), weight).split([K, 2 * K], 1)
     size, force = of_sizes(report.force, weight, flat), force.unflatten(1, (K, 2))
     whole = torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight, flat)], 1)
+    doubtful = (draws.method > int(Method.IMPORTANCE))[:, None, None]  # see _hull
+    whole = torch.where(doubtful, either(whole, _normal_resultant(problem, fit, with_tip)), whole)
     drag = None if report.axial is None else quantiles(report.axial, weight)
     tip = quantiles(state.tip_wrench(x), weight) if state.tip.size else None
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
@@ -148,7 +166,8 @@ def sampled_intervals(
         own = problem.of(unknowns) if unknowns is not problem.unknowns else problem
         for rows in index.split(CHUNK):
             if len(rows):
-                found.put(rows, intervals(posterior_draws(own.take(rows), estimate.of(rows, own.size), draws, nu)))
+                part, fit = own.take(rows), estimate.of(rows, own.size)
+                found.put(rows, intervals(posterior_draws(part, fit, draws, nu), fit))
     return found.whole(estimate)
 
 

@@ -1,15 +1,16 @@
 """Fits all along what the readings leave open, where draws are made beside the fit that is reported.
 
-Some forces bend nothing by themselves and only weigh on what bends the rod already: along the rod at its tip, and across a strip.
-The readings hardly tell such a force F, and what they leave open is a curved valley: from a rod that is pressed to one that is
-pulled a push moves along it, and one that pushes a strip harder across does so nearer the base. A normal distribution about one
-fit does not follow that. It is followed here by fits with F held at knots, each begun at its neighbour's and at what that says of
-the next,
+Some forces bend nothing by themselves and only weigh on what bends the rod already: along the rod at its tip, and across a strip;
+and so does a moment about the rod's axis. The readings hardly tell such a force F, and what they leave open is a curved valley:
+from a rod that is pressed to one that is pulled a push moves along it, one that pushes a strip harder across does so nearer the
+base, and under a torque what bends the rod turns about its axis. A normal distribution about one fit does not follow that. It is
+followed here by fits with F held at knots, each begun at its neighbour's and at what that says of the next,
 
     (1)  x_j+1 = x_j + dx/dF (F_j+1 - F_j),    dx/dF = C_xF / C_FF
 
-from F = 0 and from each fit; beside an axial force with hardly any force across the tip, then with some. About each, x is taken to
-be normal, F with OVERLAP of the way to the next.
+from F = 0 and from each fit; beside an axial force with hardly any force across the tip, then with some; beside a torque with some
+force and some moment across the tip, then with hardly any of the one or the other. About each, x is taken to be normal, F with
+OVERLAP of the way to the next.
 """
 
 from collections.abc import Callable
@@ -30,9 +31,10 @@ from .starts import Origin, Start, cold_start
 AXIAL = (-2.2, -1.6, -1.2, -0.9, -0.7, -0.55, -0.4, -0.25, -0.1, 0.0, 0.1, 0.3, 0.7, 1.5, 3.0, 6.0)  # force scales; 0.62 buckle
 ONE_SIDE = (0.03, 0.07, 0.13, 0.2, 0.3, 0.45, 0.65, 0.9, 1.25, 1.7, 2.3, 3.0, 4.0, 5.5, 7.5, 10.0, 14.0, 20.0)  # force scales
 ACROSS = (*(-F for F in reversed(ONE_SIDE)), 0.0, *ONE_SIDE)
+TORQUE = (-3.0, -2.2, -1.6, -1.1, -0.75, -0.5, -0.3, -0.15, 0.0, 0.15, 0.3, 0.5, 0.75, 1.1, 1.6, 2.2, 3.0)  # moment scales
 HELD = 1e-3  # to within
 OVERLAP = 0.6  # of the distance of two knots: a standard deviation
-HARDLY, SOME = 0.03, 0.5  # force scales across the tip
+HARDLY, SOME = 0.03, 0.5  # force and moment scales across the tip
 PUSH, PLACE = 3.0, 2.0  # standard deviations of pushes (force scales) and of eta, that no fit goes astray
 ALIGNED = 1e-6  # of the section's axes with a strip's sides
 WORSE = 40.0  # than the best fit, by its cost: such fits are none
@@ -58,32 +60,41 @@ class Valley:
 
 @dataclass(frozen=True)
 class Line:
-    """What is held: an entry of x, at knots (J,) in its units. tip: the entries that are forces across the tip. unit: a force scale
-    in the units of all these.
+    """What is held: an entry of x, at knots (J,) in its units, of which `unit` is a force or moment scale.
+
+    across: the entries that are forces across the tip, and those that are moments, each with a scale in their units. sizes: of all
+    these, in scales: of the fits from knot to knot, then of those begun at each.
     """
 
     entry: int
     knots: Float[Tensor, " J"]
-    tip: slice = field(default_factory=lambda: slice(0, 0))
     unit: float = 1.0
+    across: tuple[tuple[slice, float], ...] = ()
+    sizes: tuple[tuple[float, ...], ...] = ((),)
 
 
 def line_of(problem: Problem) -> Line | None:
     """Along what a problem has a valley; None where it has none.
 
-    A force that is unknown at the tip beside pushes at unknown places; not beside a moment that is unknown as well, which twists
-    the rod, and lateral forces with it, too far from one fit to the next. And one push on a strip whose sides lie along the axes of
-    the section.
+    A force that is unknown at the tip beside pushes at unknown places; a wrench that is unknown at the tip and nothing else, for
+    beside pushes a torque turns these, in the section frame, too far from one fit to the next. And one push on a strip whose sides
+    lie along the axes of the section.
     """
-    loads, state, scale = problem.unknowns.loads, problem.state, problem.robot.rod.force_scale
+    loads, state, rod = problem.unknowns.loads, problem.state, problem.robot.rod
     if problem.prior is not None or not isinstance(loads, GaussianCoordinates | PointCoordinates) or loads.locations is not None:
         return None
+    first, units = state.tip.at.start, [rod.force_scale] * 3 + [rod.moment_scale] * 3
+    unit = [scale / own for scale, own in zip(units, state.tip.unit.tolist(), strict=False)]
     if state.tip.size == 3 and loads.count:
-        k, unit = state.tip.at.start + 2, scale / float(state.tip.unit[2])
-        return Line(k, unit * torch.tensor(AXIAL, dtype=DTYPE), slice(k - 2, k), unit)
-    across = across_strip(problem.robot.rod)
-    if not state.tip.size and loads.count == 1 and across is not None and float(across.abs().amin()) < ALIGNED:
-        return Line(int(across.abs().argmax()), torch.tensor(ACROSS, dtype=DTYPE))
+        across = ((slice(first, first + 2), unit[0]),)
+        return Line(first + 2, unit[2] * torch.tensor(AXIAL, dtype=DTYPE), unit[2], across, ((HARDLY,), (SOME,)))
+    if state.tip.size == 6 and not loads.count:
+        across = (slice(first, first + 2), unit[0]), (slice(first + 3, first + 5), unit[3])
+        sizes = (SOME, SOME), (HARDLY, SOME), (SOME, HARDLY)
+        return Line(first + 5, unit[5] * torch.tensor(TORQUE, dtype=DTYPE), unit[5], across, sizes)
+    strip = across_strip(rod)
+    if not state.tip.size and loads.count == 1 and strip is not None and float(strip.abs().amin()) < ALIGNED:
+        return Line(int(strip.abs().argmax()), torch.tensor(ACROSS, dtype=DTYPE))
     return None
 
 
@@ -100,9 +111,10 @@ def valley(problem: Problem, x: Float[Tensor, "B n"], C: Float[Tensor, "B n n"],
         fit, of = others
         search.add(of, torch.full_like(of, -1), fit.x, fit.covariance, fit.cost)
         search.along(of, fit.x, search.nearest(fit.x))
-    if line.tip.stop:
-        at = search.knot >= 0
-        search.held(search.of[at], search.x[at], search.knot[at], SOME)
+    at = search.knot >= 0
+    of, begin, knot = search.of[at], search.x[at], search.knot[at]
+    for sizes in line.sizes[1:]:
+        search.held(of, begin, knot, sizes)
     return search.joined(x, C)
 
 
@@ -140,7 +152,7 @@ class _Search:
 
     def along(self, of: Int[Tensor, " r"], start: Float[Tensor, "r n"], first: Int[Tensor, " r"]) -> None:
         """Rows of fits both ways from starts at a first knot, until they have gone astray or come upon another row."""
-        fit, _ = self.held(of, start, first, HARDLY)
+        fit, _ = self.held(of, start, first, self.line.sizes[0])
         here, slope, of, knot = fit.x.repeat(2, 1), self._slope(fit).repeat(2, 1), of.repeat(2), first.repeat(2)
         way = torch.tensor([1, -1]).repeat_interleave(len(first))
         live = (fit.status == int(Status.CONVERGED)).repeat(2)
@@ -151,19 +163,20 @@ class _Search:
                 return
             knot = knot + way
             start = here + slope * (self.line.knots[knot] - here[:, self.line.entry]).unsqueeze(-1)
-            fit, live = self.held(of, start, knot, HARDLY)
+            fit, live = self.held(of, start, knot, self.line.sizes[0])
             here, slope = fit.x, self._slope(fit)
 
     def held(
-        self, of: Int[Tensor, " r"], start: Float[Tensor, "r n"], knot: Int[Tensor, " r"], across: float
+        self, of: Int[Tensor, " r"], start: Float[Tensor, "r n"], knot: Int[Tensor, " r"], sizes: tuple[float, ...]
     ) -> tuple[Estimate, Bool[Tensor, " r"]]:
-        """Fits with F held at knots; which of them are worth keeping, and are kept. across: force scales at the tip."""
+        """Fits with F held at knots; which of them are worth keeping, and are kept. sizes: see Line."""
         part, line, knots = self.problem.take(of), self.line, self.line.knots
         mean, precision = (v.expand(len(of), -1).clone() for v in (part.mean, part.precision))
         for i in range(0, part.state.loads.size, self.per_load):
             precision[:, i : i + 2], precision[:, i + 2], mean[:, i + 2] = PUSH**-2, PLACE**-2, 0.0
         mean[:, line.entry], precision[:, line.entry] = knots[knot], (HELD * line.unit) ** -2
-        precision[:, line.tip] = (across * line.unit) ** -2
+        for (at, unit), size in zip(line.across, sizes, strict=True):
+            precision[:, at] = (size * unit) ** -2
         fit = self.fitting(replace(part, prior=(mean, precision)), Start.at(start, Origin.ELSEWHERE))
         gap = torch.maximum(knots.diff()[(knot - 1).clamp(min=0)], knots.diff()[knot.clamp(max=len(knots) - 2)])
         slope = self._slope(fit)

@@ -18,8 +18,8 @@ class Kind:
 
     contacts: so many; noise: of the length; force, place: ranges in force scales and lengths. apart: the least and the most
     distance of neighbours, in lengths. way: "any", each its own; "same"; "opposed", each to the other side of the one before. tip:
-    "force" in any direction, "pressed" along the rod, or "moment" across it, of `size` force or moment scales. unknown: what is
-    unknown at the tip.
+    "force" or "moment" in any direction, "pressed" along the rod, or "wrench", a force and a moment, of `size` force and moment
+    scales. unknown: what is unknown at the tip.
     """
 
     name: str
@@ -48,6 +48,7 @@ TOLD = {
     "opposed": Kind("two pushes 5 to 10 % apart, opposed", 2, 1e-3, place=(0.3, 1.0), apart=(0.05, 0.1), way="opposed"),
     "three": Kind("three pushes 15 % apart or more", 3, 1e-3, apart=(0.15, 1.0)),
     "moment": Kind("nothing but a moment at the tip, wrench unknown", 0, 1e-3, tip="moment", size=(0.1, 0.5), unknown="wrench"),
+    "wrench": Kind("a force and a moment at the tip, wrench unknown", 0, 1e-3, tip="wrench", size=(0.1, 0.5), unknown="wrench"),
     "pressed": _pressed(0.1, 0.55),
     "buckled": _pressed(0.8, 1.5),
     "tip": Kind(
@@ -97,12 +98,10 @@ def _at_tip(kind: Kind, cases: int, random: torch.Generator) -> Tensor:
     tip, size = torch.zeros(cases, 6, dtype=torch.float64), _uniform(*kind.size, random, cases, 1)
     if kind.tip == "pressed":
         tip[:, 2:3] = -size
-    elif kind.tip == "moment":
-        turn = _uniform(0, 2 * math.pi, random, cases, 1)
-        tip[:, 3:5] = size * torch.cat([turn.cos(), turn.sin()], -1)
-    elif kind.tip == "force":
-        way = torch.randn(cases, 3, generator=random, dtype=torch.float64)
-        tip[:, :3] = size * way / way.norm(dim=-1, keepdim=True)
+    for name, at in (("force", slice(0, 3)), ("moment", slice(3, 6))):
+        if kind.tip in (name, "wrench"):
+            way = torch.randn(cases, 3, generator=random, dtype=torch.float64)
+            tip[:, at] = size * way / way.norm(dim=-1, keepdim=True)
     return tip
 
 
