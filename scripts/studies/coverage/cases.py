@@ -54,6 +54,9 @@ TOLD = {
     "tip": Kind(
         "push beside a force at the tip, force unknown", 1, 1e-3, (0.3, 1.0), tip="force", size=(0.1, 0.5), unknown="force"
     ),
+    "hidden": Kind(
+        "push beside force and moment at the tip, unknown", 1, 1e-3, (0.3, 1.0), tip="wrench", size=(0.1, 0.5), unknown="wrench"
+    ),
 }
 COUNTED = {
     "nothing": Kind("nothing", 0, 1e-3),
