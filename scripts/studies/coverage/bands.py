@@ -1,5 +1,6 @@
 """How often the band of f(s) holds a load of any form, and the interval its resultant, where forms compete (--load-prior auto)."""
 
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -10,13 +11,15 @@ from torch import Tensor
 
 import torchrod as tr
 from studies.reproduction.cases import steel_rod
+from torchrod.analysis.pipeline import SMOOTH_CORRELATIONS, SMOOTH_DEVIATIONS
+from torchrod.model.load_families.smooth import TERMS
 
 PIECES, STEPS, MARKERS = 400, 40, 20  # point forces that a load is made of: steps end at each
 NOISES = 1e-3, 2.5e-3  # of the length
 LEAST = 0.1  # of the peak: where f(s) counts
 SIZE = 0.5, 1.5  # of the resultant, force scales; of loads that change sign, of their mean size
 
-Form = Callable[[Tensor, torch.Generator, int], Tensor]
+Form = Callable[[Tensor, torch.Generator, int], Tensor]  # (B, T) along one direction, or (B, T, 2) of both, in force scales / L
 
 
 def _uniform(generator: torch.Generator, low: float, high: float, B: int) -> Tensor:
@@ -54,6 +57,18 @@ def contact(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
     return torch.exp(-0.5 * ((t - place) / width) ** 2) / (math.sqrt(2 * math.pi) * width)
 
 
+def of_the_prior(t: Tensor, generator: torch.Generator, B: int) -> Tensor:
+    """Of a Matern process (nu = 1/2) of any of the sizes and length scales that compete, as cosines."""
+    scales = torch.tensor(list(itertools.product(SMOOTH_DEVIATIONS, SMOOTH_CORRELATIONS)), dtype=torch.float64)
+    deviation, ell = scales[torch.randint(len(scales), (B,), generator=generator)].T.unsqueeze(-1).unbind(0)
+    k = torch.arange(TERMS, dtype=torch.float64)
+    unit = deviation * (2 * ell / (1 + (k * math.pi * ell) ** 2) * torch.where(k > 0, 2.0, 1.0)).sqrt()
+    z = torch.randn(B, 2, TERMS, generator=generator, dtype=torch.float64)
+    return torch.einsum("bk,bck,tk->btc", unit, z, torch.cos(math.pi * t.unsqueeze(-1) * k))
+
+
+OF_THE_PRIOR = "drawn from the prior of a smooth load"
+WITHOUT_PLACE = "sine", OF_THE_PRIOR  # of no net force to speak of
 FORMS: dict[str, Form] = {
     "uniform over 30 % of the rod": even(0.3),
     "uniform over 60 %": even(0.6),
@@ -61,6 +76,7 @@ FORMS: dict[str, Form] = {
     "half sine": half_sine,
     "sine": sine,
     "contact": contact,
+    OF_THE_PRIOR: of_the_prior,
 }
 
 
@@ -88,7 +104,10 @@ def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) ->
     def density(t: Tensor) -> Tensor:
         """(B, T, 2) N/m at s / L."""
         generator.set_state(state)
-        return (size * form(t, generator, cases) / L).unsqueeze(-1) * torch.stack([turn.cos(), turn.sin()], -1)
+        found = form(t, generator, cases)
+        if found.ndim == 2:
+            found = (size / rod.force_scale * found).unsqueeze(-1) * torch.stack([turn.cos(), turn.sin()], -1)
+        return rod.force_scale / L * found
 
     t = (torch.arange(PIECES, dtype=torch.float64) + 0.5) / PIECES
     forces = torch.nn.functional.pad(density(t) * L / PIECES, (0, 1))
@@ -138,7 +157,8 @@ def head(cases: int) -> list[str]:
         "their form, and with `--load-prior smooth`. Band: share (%) of the places where |f| is above a tenth of its peak at which",
         "the 95 % band holds it; its mean width over the peak, median. Resultant: share of samples whose 95 % interval holds",
         "|resultant|. Force, place: of what is told as one load, its net force and its moment over that (none of a whole wave,",
-        "whose net force is nothing). CPU in seconds a shape.",
+        "whose net force is nothing). CPU in seconds a shape. The last rows are of what a smooth load is taken",
+        "to be: what is smoother than most of it is held more often, what is rougher less, and a contact hardly.",
         "",
         "| load, noise (of L) | auto: band | width | force | place | resultant | CPU | smooth: band | width | force | place "
         "| resultant | CPU |",
@@ -152,6 +172,6 @@ def line(row: str, cases: int) -> str:
     cells = []
     for prior in ("auto", "smooth"):
         held = measured(FORMS[name], float(noise.removesuffix(" %")) / 100, prior, cases)
-        of_one = ["-", "-"] if name == "sine" else [f"{100 * share:.1f}" for share in (held.force, held.place)]
+        of_one = ["-", "-"] if name in WITHOUT_PLACE else [f"{100 * share:.1f}" for share in (held.force, held.place)]
         cells += [f"{100 * held.band:.1f}", f"{held.width:.2f}", *of_one, f"{100 * held.resultant:.1f}", f"{held.cpu:.2f}"]
     return f"| {row} | {' | '.join(cells)} |"
