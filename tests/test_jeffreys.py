@@ -12,6 +12,7 @@ from tests.test_edges import strip
 from torchrod.estimation import filter as ekf
 from torchrod.estimation.chart import Chart
 from torchrod.estimation.evaluator import evaluator
+from torchrod.estimation.intervals import _normal_resultant, resultant
 from torchrod.estimation.jeffreys import Information
 from torchrod.model.problem import TIP_ROWS
 
@@ -117,6 +118,73 @@ def test_a_strip_keeps_its_own_prior_of_what_pushes_across_it():
     p = Chart.at(problem, torch.nn.functional.pad(y[:, 0], (0, 6)), jeffreys=True).log_prior(y)[0]
     assert abs(float(p[1] - p[0])) < 0.15
     assert math.isclose(float(p[2] - p[0]), math.log(10), rel_tol=0.02)  # dF dF |dg/ds F|, as one of the two is along the soft side
+
+
+@pytest.mark.parametrize("friction", [None, 0.3, math.inf])
+@pytest.mark.parametrize("family", [tr.GaussianCoordinates, tr.PointCoordinates])
+@pytest.mark.parametrize("flat", [False, True])
+def test_contacts_that_drag_have_intervals_on_rods_and_strips(friction, family, flat):
+    """Of a strip, with friction known, the soft side has two numbers and a force three."""
+    robot = strip(1e6) if flat else steel_rod()
+    length, scale = robot.rod.length, robot.rod.force_scale
+    s = torch.linspace(length / 20, length, 20, dtype=torch.float64)
+    load = tr.PointForces(torch.tensor([[[0.5 * scale, 0.1 * scale, 0.0]]], dtype=torch.float64), torch.tensor([[0.6 * length]]))
+    p = tr.solve_shape(robot, (load,), None, s, 1, 160).p
+    p = p + 1e-3 * length * torch.randn(p.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    problem = tr.Problem(robot, tr.Unknowns(family(1, length, scale, friction=friction)), [tr.Markers(s, p, 1e-3 * length)])
+    fit = tr.estimate(problem)
+    found = tr.sampled_intervals(problem, fit)
+    assert bool(fit.accepted.all()) and bool(torch.isfinite(found.magnitude).all() and torch.isfinite(found.location).all())
+    low, high = found.location[0, 0]
+    assert float(low) < 0.6 * length < float(high)
+
+
+def test_many_draws_at_once_or_a_few(monkeypatch):
+    problem, _, _ = pushed(3, (0.5, 1.0), (0.1, 0.4), 4e-4, apart=0.03)
+    fit = tr.estimate(problem)
+    chart = Chart.at(problem, fit.x, jeffreys=True)
+    y = fit.x[:, None, : chart.size] + 0.1 * torch.randn(3, 7, chart.size, generator=torch.Generator().manual_seed(0))
+    once = chart.log_prior(y)
+    monkeypatch.setattr("torchrod.estimation.jeffreys.AT_ONCE", 1000)
+    assert torch.allclose(chart.log_prior(y), once, atol=1e-9)
+
+
+def test_a_base_frame_whose_turn_is_unknown_leaves_the_direction_of_a_push_open():
+    """Nothing tells a turn about a straight rod but its prior; draws about the fit have a tenth of it."""
+    robot, turn = steel_rod(), 0.175
+    s = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
+    scale = robot.rod.force_scale
+    load = tr.PointForces(torch.tensor([[[0.5 * scale, 0.0, 0.0]]], dtype=torch.float64), torch.tensor([[0.3]]))
+    p = tr.solve_shape(robot, (load,), None, s, 1, 160).p
+    p = p + 1e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    registration = tr.Registration(1e-3, turn)
+    unknowns = tr.Unknowns(tr.GaussianCoordinates(1, L, scale), registration=registration)
+    problem = tr.Problem(robot, unknowns, [tr.Markers(s, p, 1e-4)])
+    fit = tr.estimate(problem)
+    found = tr.sampled_intervals(problem, fit)
+    across = found.resultant[0, 1]  # of a push along x
+    assert float(across[1] - across[0]) > 0.8 * 2 * 1.96 * turn * float(fit.magnitude[0, 0])
+    section = found.force[0, 0, 1]
+    assert float(section[1] - section[0]) > 0.8 * 2 * 1.96 * turn * float(fit.magnitude[0, 0])
+
+
+@pytest.mark.parametrize("unknown", ["mass", "gravity"])
+def test_the_normal_interval_of_a_resultant_counts_all_that_is_unknown(unknown):
+    """Weight too: against differences."""
+    robot = replace(steel_rod(), gravity=torch.tensor([0.0, 3.0, -9.0], dtype=torch.float64))
+    robot = replace(robot, rod=replace(robot.rod, mass_per_length=torch.tensor(0.15, dtype=torch.float64)))
+    problem, _, _ = pushed(2, (0.5, 1.0), (0.1, 0.4), 1e-3)
+    uncertain = tr.Uncertainty(mass=0.1) if unknown == "mass" else tr.Uncertainty(gravity=0.5)
+    problem = tr.Problem(robot, replace(problem.unknowns, uncertainty=uncertain), problem.sensors)
+    fit = tr.estimate(problem)
+    at = fit.x.unsqueeze(1)
+    step = 1e-5 * torch.eye(problem.size, dtype=torch.float64)
+    slope = torch.cat([(resultant(problem, at + e) - resultant(problem, at - e)) / 2e-5 for e in step], 1).mT
+    std = (slope @ fit.covariance @ slope.mT).diagonal(dim1=-2, dim2=-1).sqrt()
+    found = _normal_resultant(problem, fit, False)
+    assert torch.allclose((found[:, :3, 1] - found[:, :3, 0]) / (2 * 1.959964), std, rtol=1e-4)
+    size = resultant(problem, at).norm(dim=-1).squeeze(1)
+    assert bool(((found[:, 3, 0] <= size) & (size <= found[:, 3, 1]) & (found[:, 3, 0] >= 0)).all())
 
 
 def test_the_units_of_the_unknowns_do_not_move_intervals():

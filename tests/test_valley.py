@@ -12,10 +12,9 @@ from tests.test_edges import L as STRIP
 from tests.test_edges import strip
 from tests.test_tip import compressed
 from torchrod.estimation.chart import BUCKLES, FAINT, GIVES_WAY, TWISTS, Chart, _log_size, _Sized
-from torchrod.estimation.draws import Method, _Target
+from torchrod.estimation.draws import _Target
 from torchrod.estimation.elsewhere import cheapest, fits_elsewhere, marks
 from torchrod.estimation.evaluator import evaluator
-from torchrod.estimation.intervals import intervals, resultant
 from torchrod.estimation.proposal import Mixture, OnGrid, Proposal, Student
 from torchrod.estimation.solve import Settings, solver_of
 from torchrod.estimation.valley import _Search, line_of, valley
@@ -141,26 +140,6 @@ def test_fits_of_a_wrench_are_told_apart_by_its_moment_too():
     x = torch.zeros(2, problem.size)
     x[1, problem.state.tip.at.stop - 1] = 0.5
     assert float((marks(problem, x)[1] - marks(problem, x)[0]).norm()) > 0.4
-
-
-@pytest.mark.parametrize("kind", ["tip", "strip"])
-def test_a_resultant_takes_in_what_the_covariance_says_where_draws_may_miss_some(kind):
-    """|R| and each component, and the least size is nothing."""
-    problem = of_kind(kind, 6)
-    fit = tr.estimate(problem)
-    draws = tr.posterior_draws(problem, fit, 64)
-    sure, doubtful = (intervals(replace(draws, method=torch.full_like(draws.method, int(m))), fit) for m in Method if m in (1, 3))
-    assert bool((doubtful.resultant[..., 0] <= sure.resultant[..., 0]).all())
-    assert bool((doubtful.resultant[..., 1] >= sure.resultant[..., 1]).all())
-    R = resultant(problem, fit.x.unsqueeze(1)).squeeze(1)
-    for at in (0, 1, 2):  # by the model's own derivatives
-        step = 1e-5 * torch.eye(problem.size)
-        slope = torch.stack([(resultant(problem, (fit.x + e).unsqueeze(1)) - R.unsqueeze(1))[:, 0, at] / 1e-5 for e in step], -1)
-        std = torch.einsum("bi,bij,bj->b", slope, fit.covariance, slope).sqrt()
-        assert bool((doubtful.resultant[:, at, 1] >= R[:, at] + 1.95 * std - 1e-9).all())
-    size = R.norm(dim=-1)
-    assert bool(((doubtful.resultant[:, 3, 0] <= size) & (size <= doubtful.resultant[:, 3, 1])).all())
-    assert float(doubtful.resultant[:, 3, 0].min()) >= 0
 
 
 def test_the_spread_of_a_push_across_a_strip_is_of_both_signs():

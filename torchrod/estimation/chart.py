@@ -398,7 +398,8 @@ class Chart:
         pushes, K, d = self._pushes, len(self.places), self.components
         assert pushes is not None
         F = self._with_forces(y)[..., self.linear[: d * K]].unflatten(-1, (K, d))
-        ways = torch.eye(d, dtype=DTYPE)[: len(pushes.at) // K] if pushes.axis is None else pushes.axis.unsqueeze(0)
+        axes = torch.eye(d, dtype=DTYPE)
+        ways = axes[: len(pushes.at) // K] if pushes.axis is None else pushes.axis @ axes[:2].unflatten(0, (1, 2))
         weak = -0.5 * pushes.of(y).square().sum(-1) / pushes.weak**2
         return information.log_root(y[..., self.places], F, ways) + weak
 

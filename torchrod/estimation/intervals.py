@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ..model.problem import Problem
@@ -16,6 +16,7 @@ from .draws import DRAWS, Draws, Method, picked, posterior_draws, systematic
 from .load_profile import DRAWS as OF_BAND
 from .load_profile import LEVELS, NODES, band_of_draws
 from .result import Z95, Estimate
+from .valley import line_of
 
 FLAT = 0.3  # times EI: how stiff the soft side of a flat rod is at most
 ALL_THREE = (0.0085, 0.9915)  # between which three numbers are in 95 % of cases
@@ -26,7 +27,7 @@ CHUNK = 64  # samples at a time: their draws are not kept
 @dataclass(frozen=True)
 class Intervals:
     """95 % intervals of B samples; NaN where a fit has not converged or its draws are not to be trusted (k_hat above 1). Where the
-    first proposal did not do (method), those of loads, resultant and tip take in the normal ones.
+    first proposal did not do (method), those of loads and tip take in the normal ones.
 
     magnitude, location (B, K, 2) N, m, and force (B, K, 2, 2) N of every load, in the section frame; axial (B, K, 2) N of its force
     along the rod, or None. resultant (B, 4, 2) N: of the three components, in the base frame, and the size of all that pushes
@@ -99,18 +100,35 @@ def resultant(problem: Problem, x: Float[Tensor, "B D n"], with_tip: bool = Fals
 
 def _normal_resultant(problem: Problem, fit: Estimate, with_tip: bool) -> Float[Tensor, "B 4 2"]:
     """By the covariance of a fit."""
-    base, tip, J = problem.state.base, problem.state.tip, fit.x.new_zeros(3, problem.size)
-    J[:, base.at.start : base.at.start + 3] = base.unit[:3].diag()
-    if tip.size and not with_tip:
-        J[:, tip.at.start : tip.at.start + 3] = -tip.unit[:3].diag()
-    R, C = resultant(problem, fit.x.unsqueeze(1), with_tip).squeeze(1), J @ fit.covariance @ J.mT
+    with torch.inference_mode(False), torch.enable_grad():
+        x = fit.x.clone().requires_grad_()
+        R = resultant(problem, x.unsqueeze(1), with_tip).squeeze(1)
+        J = torch.stack([torch.autograd.grad(R[:, i].sum(), x, retain_graph=True)[0] for i in range(3)], 1)
+    R, C = R.detach(), J @ fit.covariance @ J.mT
     size = R.norm(dim=-1, keepdim=True)
     way = R / size.clamp(min=1e-300)
     along = (way * (C @ way.unsqueeze(-1)).squeeze(-1)).sum(-1, keepdim=True)
     std = torch.cat([C.diagonal(dim1=-2, dim2=-1), along], -1).clamp(min=0).sqrt()
-    low, high = (torch.cat([R, size], -1) + sign * Z95 * std for sign in (-1.0, 1.0))
-    low[:, 3] = low[:, 3].clamp(min=0.0)
-    return torch.stack([low, high], -1)
+    whole = _normal(torch.cat([R, size], -1), std)
+    return torch.cat([whole[:, :3], whole[:, 3:].clamp(min=0.0)], 1)
+
+
+def _normal(value: Float[Tensor, "*n"], std: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
+    return value.unsqueeze(-1) + std.unsqueeze(-1) * Z95 * value.new_tensor([-1.0, 1.0])
+
+
+def _deviations(C: Float[Tensor, "*n m m"]) -> Float[Tensor, "*n m"]:
+    return C.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+
+
+def _missed(draws: Draws) -> Bool[Tensor, " B"]:
+    """Where draws about a fit miss much of what turns in space what pushes: beside a wrench at the tip, by its torque, where the
+    first proposal did not do; and with a base frame whose turn about the rod nothing tells.
+    """
+    state, problem = draws.problem.state, draws.problem
+    if state.registration.size:
+        return torch.ones_like(draws.method, dtype=torch.bool)
+    return (draws.method > int(Method.IMPORTANCE)) & (state.tip.size == 6 and line_of(problem) is None)
 
 
 def intervals(draws: Draws, fit: Estimate, with_tip: bool = False) -> Intervals:
@@ -123,8 +141,12 @@ def intervals(draws: Draws, fit: Estimate, with_tip: bool = False) -> Intervals:
     place, force = quantiles(torch.cat([report.location, report.force.flatten(-2)], -1), weight).split([K, 2 * K], 1)
     size, force = of_sizes(report.force, weight, flat), force.unflatten(1, (K, 2))
     whole = torch.cat([quantiles(R, weight), of_sizes(R.unsqueeze(2), weight, flat)], 1)
-    doubtful = (draws.method > int(Method.IMPORTANCE))[:, None, None]  # see _hull
-    whole = torch.where(doubtful, either(whole, _normal_resultant(problem, fit, with_tip)), whole)
+    missed = _missed(draws)
+    if bool(missed.any()):
+        rows = missed[:, None, None]
+        whole = torch.where(rows, either(whole, _normal_resultant(problem, fit, with_tip)), whole)
+        turned = _normal(fit.force, _deviations(fit.load_covariance[..., :2, :2]))[:, :K]
+        force = torch.where(rows.unsqueeze(-1), either(force, turned), force)
     drag = None if report.axial is None else quantiles(report.axial, weight)
     tip = quantiles(state.tip_wrench(x), weight) if state.tip.size else None
     s = torch.linspace(0.0, problem.robot.rod.length, NODES, dtype=DTYPE)
@@ -222,18 +244,13 @@ def _hull(drawn: Intervals, fit: Estimate) -> Intervals:
         return torch.where(doubtful.reshape(-1, *[1] * (own.ndim - 1)) & known, either(own, normal), own)
 
     def about(value: Tensor | None, std: Tensor | None) -> Tensor | None:
-        return (
-            None if value is None or std is None else value.unsqueeze(-1) + std.unsqueeze(-1) * Z95 * value.new_tensor([-1.0, 1.0])
-        )
-
-    def deviations(C: Tensor | None) -> Tensor | None:
-        return None if C is None else C.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+        return None if value is None or std is None else _normal(value, std)
 
     return replace(
         drawn,
         magnitude=joined(drawn.magnitude, fit.magnitude_interval),
         location=joined(drawn.location, fit.location_interval),
-        force=joined(drawn.force, about(fit.force, deviations(fit.load_covariance[..., :2, :2]))),
+        force=joined(drawn.force, _normal(fit.force, _deviations(fit.load_covariance[..., :2, :2]))),
         axial=joined(drawn.axial, about(fit.axial, fit.axial_std)),
-        tip=joined(drawn.tip, about(fit.tip, deviations(fit.tip_covariance))),
+        tip=joined(drawn.tip, about(fit.tip, None if fit.tip_covariance is None else _deviations(fit.tip_covariance))),
     )

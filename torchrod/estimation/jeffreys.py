@@ -24,6 +24,7 @@ from ..util.precision import DTYPE
 from . import filter as ekf
 
 LEAST = 1e-9  # of the eigenvalues of I, over its diagonal: round-off
+AT_ONCE = 2**24  # numbers of G that are gathered at a time
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,13 @@ class Information:
         self, eta: Float[Tensor, "B D K"], force: Float[Tensor, "B D K d"], ways: Float[Tensor, "w d"]
     ) -> Float[Tensor, "B D"]:
         """log of (1), of pushes of these forces, of which the components along `ways` are unknown."""
+        (B, _, K), d = eta.shape, ways.shape[1]
+        each = max(1, AT_ONCE // (B * (4 * K * d) ** 2))
+        return torch.cat([self._log_root(*part, ways) for part in zip(eta.split(each, 1), force.split(each, 1), strict=True)], 1)
+
+    def _log_root(
+        self, eta: Float[Tensor, "B D K"], force: Float[Tensor, "B D K d"], ways: Float[Tensor, "w d"]
+    ) -> Float[Tensor, "B D"]:
         (B, D, K), (w, d), N = eta.shape, ways.shape, math.isqrt(self.gram.shape[1])
         place = torch.sigmoid(eta)
         near, share, slope = _cubic(place * (N - 1), N)
