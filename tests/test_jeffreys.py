@@ -11,9 +11,11 @@ from tests.robots import steel_rod
 from tests.test_edges import strip
 from torchrod.estimation import filter as ekf
 from torchrod.estimation.chart import Chart
+from torchrod.estimation.draws import Method
 from torchrod.estimation.evaluator import evaluator
-from torchrod.estimation.intervals import _normal_resultant, resultant
+from torchrod.estimation.intervals import _normal_resultant, either, intervals, resultant
 from torchrod.estimation.jeffreys import Information
+from torchrod.model.load_families.family import WEAK_STD
 from torchrod.model.problem import TIP_ROWS
 
 L = 0.4
@@ -115,9 +117,27 @@ def test_a_strip_keeps_its_own_prior_of_what_pushes_across_it():
     )
     y = torch.zeros(1, 4, problem.state.base.at.start, dtype=torch.float64)
     y[0, :, :2] = torch.tensor([[1e-3, 0.1], [1e-3, 0.5], [1e-2, 0.1], [1e-2, 0.5]])
-    p = Chart.at(problem, torch.nn.functional.pad(y[:, 0], (0, 6)), jeffreys=True).log_prior(y)[0]
+    chart = Chart.at(problem, torch.nn.functional.pad(y[:, 0], (0, 6)), jeffreys=True)
+    p = chart.log_prior(y)[0]
     assert abs(float(p[1] - p[0])) < 0.15
     assert math.isclose(float(p[2] - p[0]), math.log(10), rel_tol=0.02)  # dF dF |dg/ds F|, as one of the two is along the soft side
+    assert chart.response is not None and chart.response.information is not None
+    eta = torch.tensor([-1.0, 0.0, 1.0, 2.0], dtype=torch.float64)
+    y[0, :, 2] = eta
+    along_x = torch.tensor([[1.0, 0.0]], dtype=torch.float64)  # the soft side
+    by_hand = chart.response.information.log_root(eta.view(1, -1, 1), y[..., None, :2], along_x)
+    assert torch.allclose(chart._log_jeffreys(y, chart.response.information), by_hand, atol=1e-5)
+
+
+def test_it_is_within_the_weak_prior_of_the_fit():
+    """By itself it grows with the forces."""
+    problem, _, _ = pushed(1, (0.5, 1.0), (0.1, 0.3), 4e-4)
+    fit = tr.estimate(problem)
+    chart = Chart.at(problem, fit.x, jeffreys=True)
+    y = fit.x[:, None, : chart.size].expand(1, 2, -1).clone()
+    y[0, :, :2] = torch.tensor([[5.0, 0.0], [10.0, 0.0]])
+    p = chart.log_prior(y)[0]
+    assert math.isclose(float(p[1] - p[0]), math.log(2) - 0.5 * (10.0**2 - 5.0**2) / WEAK_STD**2, rel_tol=1e-6)
 
 
 @pytest.mark.parametrize("friction", [None, 0.3, math.inf])
@@ -164,8 +184,20 @@ def test_a_base_frame_whose_turn_is_unknown_leaves_the_direction_of_a_push_open(
     found = tr.sampled_intervals(problem, fit)
     across = found.resultant[0, 1]  # of a push along x
     assert float(across[1] - across[0]) > 0.8 * 2 * 1.96 * turn * float(fit.magnitude[0, 0])
-    section = found.force[0, 0, 1]
-    assert float(section[1] - section[0]) > 0.8 * 2 * 1.96 * turn * float(fit.magnitude[0, 0])
+    assert float(found.force[0, 0, 1].diff()) > 0.8 * 2 * 1.96 * turn * float(fit.magnitude[0, 0])
+    draws = tr.posterior_draws(problem, fit)  # whatever the proposal that did
+    section = intervals(replace(draws, method=torch.ones_like(draws.method)), fit).force[0, 0, 1]
+    assert float(section.diff()) > 0.8 * 2 * 1.96 * turn * float(fit.magnitude[0, 0])
+
+
+def test_beside_a_wrench_at_the_tip_a_resultant_takes_in_the_normal_one_where_draws_miss_much():
+    problem, _, _ = pushed(3, (0.5, 1.0), (0.1, 0.3), 4e-4)
+    problem = problem.of(replace(problem.unknowns, tip="wrench"))
+    fit = tr.estimate(problem)
+    draws = replace(tr.posterior_draws(problem, fit, 32), k_hat=torch.zeros(3, dtype=torch.float64))
+    sure, missed = (intervals(replace(draws, method=torch.full_like(draws.method, int(m))), fit) for m in Method if m in (1, 3))
+    assert torch.allclose(missed.resultant, either(sure.resultant, _normal_resultant(problem, fit, False)))
+    assert not torch.allclose(missed.resultant, sure.resultant) and not torch.allclose(missed.force, sure.force)
 
 
 @pytest.mark.parametrize("unknown", ["mass", "gravity"])
@@ -183,8 +215,11 @@ def test_the_normal_interval_of_a_resultant_counts_all_that_is_unknown(unknown):
     std = (slope @ fit.covariance @ slope.mT).diagonal(dim1=-2, dim2=-1).sqrt()
     found = _normal_resultant(problem, fit, False)
     assert torch.allclose((found[:, :3, 1] - found[:, :3, 0]) / (2 * 1.959964), std, rtol=1e-4)
-    size = resultant(problem, at).norm(dim=-1).squeeze(1)
-    assert bool(((found[:, 3, 0] <= size) & (size <= found[:, 3, 1]) & (found[:, 3, 0] >= 0)).all())
+    size = resultant(problem, at).norm(dim=-1)
+    slope = torch.cat([(resultant(problem, at + e).norm(dim=-1) - resultant(problem, at - e).norm(dim=-1)) / 2e-5 for e in step], 1)
+    std = torch.einsum("bi,bij,bj->b", slope, fit.covariance, slope).sqrt()
+    assert torch.allclose((found[:, 3, 1] - size.squeeze(1)) / 1.959964, std, rtol=1e-4)
+    assert bool((found[:, 3, 0] >= 0).all())
 
 
 def test_the_units_of_the_unknowns_do_not_move_intervals():
@@ -203,6 +238,19 @@ def test_intervals_are_by_it_and_the_evidence_is_not():
     known = problem.of(tr.Unknowns(tr.GaussianCoordinates(1, L, problem.robot.rod.force_scale, locations=(0.3,))))
     draws = tr.posterior_draws(known, tr.estimate(known))
     assert not draws.has_pushes and bool(torch.isfinite(draws.log_evidence).all())
+
+
+@pytest.mark.many_fits
+def test_where_the_number_of_pushes_is_found_intervals_are_by_it_too():
+    """Of the pushes that are reported, as if their number had been told."""
+    problem, _, _ = pushed(6, (0.3, 0.4), (0.06, 0.12), 4e-4, seed=1)
+    found = tr.analyze(problem, tr.contact_hypotheses(problem, "auto")[:3], sampled=True)
+    one = found.estimate.accepted & found.estimate.location[:, 1:].isnan().all(-1)
+    assert int(one.sum()) >= 3 and found.intervals is not None
+    fit = tr.estimate(problem)
+    told = tr.sampled_intervals(problem, fit).location[one, 0]
+    other = intervals(tr.posterior_draws(problem, fit, prior="normalized"), fit).location[one, 0]
+    assert torch.allclose(found.intervals.location[one, 0], told, atol=2e-3) and not torch.allclose(other, told, atol=2e-3)
 
 
 @pytest.mark.many_fits

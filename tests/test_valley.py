@@ -132,7 +132,7 @@ def test_intervals_of_a_wrench_at_the_tip_hold_as_often_as_they_say():
     found = tr.sampled_intervals(problem, tr.estimate(problem)).tip
     assert found is not None
     held = (found[..., 0] <= wrench) & (wrench <= found[..., 1])
-    assert float(held.double().mean()) > 0.89
+    assert float(held.double().mean()) > 0.91  # 0.90 about one fit, 0.88 by a prior that takes one of the two to be nothing
 
 
 def test_fits_of_a_wrench_are_told_apart_by_its_moment_too():

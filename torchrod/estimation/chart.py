@@ -399,7 +399,7 @@ class Chart:
         assert pushes is not None
         F = self._with_forces(y)[..., self.linear[: d * K]].unflatten(-1, (K, d))
         axes = torch.eye(d, dtype=DTYPE)
-        ways = axes[: len(pushes.at) // K] if pushes.axis is None else pushes.axis @ axes[:2].unflatten(0, (1, 2))
+        ways = axes[: len(pushes.at) // K] if pushes.axis is None else (pushes.axis @ axes[:2]).unsqueeze(0)
         weak = -0.5 * pushes.of(y).square().sum(-1) / pushes.weak**2
         return information.log_root(y[..., self.places], F, ways) + weak
 

@@ -117,13 +117,8 @@ def _pushes(problem: Problem, x: Float[Tensor, "... n"]) -> tuple[Float[Tensor, 
     return each[..., :2], torch.sigmoid(each[..., 2])
 
 
-def _tip_force(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... 3"]:
-    """In force scales."""
-    return _tip_wrench(problem, x)[..., :3]
-
-
-def _tip_wrench(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... q"]:
-    """What is unknown of it, in force and moment scales."""
+def _at_tip(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... q"]:
+    """What is unknown there: nothing, a force, or a force and a moment; in force and moment scales."""
     tip, rod = problem.state.tip, problem.robot.rod
     scale = x.new_tensor([rod.force_scale] * 3 + [rod.moment_scale] * 3)[: tip.size]
     return x[..., tip.at] * (tip.unit / scale)
@@ -137,7 +132,7 @@ def _wrench(problem: Problem, shape: Shape, x: Float[Tensor, "B n"]) -> tuple[Fl
     F = rotate(shape.q[rows, at], torch.nn.functional.pad(scale * lateral, (0, 1)))
     force, moment = F.sum(1), cross(shape.p[rows, at], F).sum(1)
     if problem.state.tip.size:
-        F_tip = scale * _tip_force(problem, x)
+        F_tip = scale * _at_tip(problem, x)[..., :3]
         force, moment = force + F_tip, moment + cross(shape.p[:, -1], F_tip)
     return force, moment
 
@@ -156,7 +151,7 @@ def marks(problem: Problem, x: Float[Tensor, "... n"]) -> Float[Tensor, "... c"]
     """
     force, place = _pushes(problem, x)
     across = across_strip(problem.robot.rod)
-    return torch.cat([place, _tip_wrench(problem, x), *(() if across is None else (force @ across,))], -1)
+    return torch.cat([place, _at_tip(problem, x), *(() if across is None else (force @ across,))], -1)
 
 
 def _beside_the_tip(problem: Problem, x: Float[Tensor, "B n"]) -> list[Float[Tensor, "B n"]]:

@@ -8,9 +8,9 @@ g(s) and (dg/ds F) ds/deta.
 
 A prior that is even in place and force leaves most of its room to pushes near the base, where any force hardly shows, and one that
 is even in log |F| to faint ones. Where the readings leave one of two pushes open, intervals are then about those. By (1) what the
-readings cannot tell apart has no room, and intervals hold the truth as often as they say, to second order in the noise. It has no
-integral, so it tells no evidence.
-Source: Jeffreys, Proc. R. Soc. A 186 (1946) 453; Kass and Wasserman, J. Am. Stat. Assoc. 91 (1996) 1343.
+readings cannot tell apart has no room. Of one number, intervals then hold the truth as often as they say, to second order in the
+noise; of several, docs/coverage.md counts it. (1) has no integral, so it tells no evidence.
+Source: Jeffreys, Proc. R. Soc. A 186 (1946) 453; Welch and Peers, J. R. Stat. Soc. B 25 (1963) 318.
 """
 
 import math
