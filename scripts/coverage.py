@@ -11,9 +11,10 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from studies.coverage import bands, counted, told
+from studies.coverage import bands, counted, told, untold
 from studies.coverage.cases import COUNTED, TOLD
 
+PARTS = ["told", "counted", "untold", "bands"]
 HEAD = [
     "# Coverage of 95 % intervals",
     "",
@@ -29,6 +30,7 @@ def parts(cases: int, forms: int) -> dict[str, tuple[list[str], Callable[[str, i
     return {
         "told": (told.HEAD, told.line, list(TOLD), cases),
         "counted": (counted.HEAD, counted.line, list(COUNTED), cases),
+        "untold": (untold.HEAD, untold.line, list(untold.ROWS), cases),
         "bands": (bands.head(forms), bands.line, bands.ROWS, forms),
     }
 
@@ -38,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=500, help="of each kind")
     parser.add_argument("--forms", type=int, default=500, help="loads of each form, for the bands of f(s)")
-    parser.add_argument("--only", nargs="+", choices=["told", "counted", "bands"], default=["told", "counted", "bands"])
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--out", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)  # before the work that would be lost

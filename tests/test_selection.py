@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from torchrod import (
     PointForces,
     PointWrenches,
     Problem,
+    Settings,
     analyze,
     contact_hypotheses,
     estimate,
@@ -22,7 +24,7 @@ from torchrod import (
     solve_shape,
 )
 from torchrod.analysis.count import Hypothesis, bic, select
-from torchrod.analysis.score_test import start_with_one_more
+from torchrod.analysis.score_test import drop_by_tip_force, start_with_one_more
 from torchrod.cli import main
 from torchrod.estimation.evaluator import evaluator
 
@@ -65,6 +67,49 @@ def test_the_score_points_at_the_missing_load():
     assert (found.drop > 3 * math.log(60)).all()
     assert ((0.4 * torch.sigmoid(found.eta) - 0.3).abs() < 0.04).all()
     assert (found.force * steel_rod().rod.force_scale - T([0.0, 0.3])).abs().max() < 0.1
+
+
+def push_and_tip_force(B: int, size: float, seed: int, noise: float) -> Problem:
+    """One contact told, beside a force of so many scales at the tip in any direction."""
+    random, robot = torch.Generator().manual_seed(seed), steel_rod()
+    turn = 6.3 * torch.rand(B, 1, generator=random, dtype=torch.float64)
+    push = PointForces(0.6 * torch.stack([turn.cos(), turn.sin(), 0 * turn], -1), 0.15 + 0.15 * torch.rand(B, 1, generator=random))
+    way = torch.randn(B, 3, generator=random, dtype=torch.float64)
+    force = size * robot.rod.force_scale * way / way.norm(dim=-1, keepdim=True)
+    loads = (push, PointWrenches(force[:, None], 0 * force[:, None], T([0.4])))
+    return Problem(robot, unknowns_of(robot, 1), [markers_of(loads, B, seed + 1, noise)])
+
+
+@pytest.mark.parametrize("nu", [math.inf, 8.0])
+def test_the_score_of_a_tip_force_is_what_it_takes_off_the_cost(nu):
+    """Of least squares by rows, with the tip out of balance at a price; robust: from the weights of the fit."""
+    problem = push_and_tip_force(4, 0.05, 3, 1e-3)
+    x = estimate(problem, settings=Settings(robust=nu)).x
+    first, costs = problem.state.tip.at.start, []
+    for tip in ("none", "force"):
+        part = problem.of(replace(problem.unknowns, tip=tip))
+        at = torch.cat([x[:, :first], x.new_zeros(len(x), part.state.tip.size), x[:, first:]], -1)
+        h, H = part.linearized(at)
+        r, w = part.reading - h, part.weights.clone()
+        square = (w * r**2)[:, : len(part.groups)].unflatten(1, (-1, 3)).sum(-1)
+        if math.isfinite(nu):
+            w[:, : len(part.groups)] *= ((nu + 3) / (nu + square)).repeat_interleave(3, 1)
+        w[:, len(part.groups) :] *= 1e6
+        rows = torch.cat([w.sqrt().unsqueeze(-1) * H, torch.diag_embed(part.precision.sqrt().expand_as(at))], 1)
+        of = torch.cat([w.sqrt() * r, part.precision.sqrt() * (part.mean - at)], 1)
+        left = of - (rows @ torch.linalg.lstsq(rows, of.unsqueeze(-1)).solution).squeeze(-1)
+        costs.append(left.square().sum(-1))
+    assert torch.allclose(drop_by_tip_force(problem, x, nu), costs[0] - costs[1], rtol=1e-3)
+    assert bool((costs[0] - costs[1] > 0.1).any())
+
+
+@pytest.mark.study
+def test_without_a_force_at_the_tip_its_score_is_chi_square():
+    """With 3 degrees of freedom: mean 3, above 7.8 in 5 %."""
+    problem = push_and_tip_force(400, 0.0, 4, 1e-3)
+    drop = drop_by_tip_force(problem, estimate(problem).x)
+    assert abs(float(drop.mean()) - 3.0) < 0.4
+    assert 0.02 < float((drop > 7.815).double().mean()) < 0.09
 
 
 def run(folder, markers: Markers, *options: str) -> list[dict]:

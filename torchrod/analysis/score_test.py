@@ -1,4 +1,4 @@
-"""Would one more load help, and where? A score test on the residual of a fit, and the start it suggests for a fit with that load.
+"""Would one more load help, and where? Score tests on the residual of a fit, and the start it suggests for a fit with that load.
 
 At a fit, add a point-like load at each of J places, with no force yet. With b the entries of the fitted state, c the two force
 components at one place, A = H^T W H + P and g = H^T W r + P (x0 - x), to first order in the new force
@@ -8,9 +8,11 @@ components at one place, A = H^T W H + P and g = H^T W r + P (x0 - x), to first 
     (3)  drop = F^T S F                          by which the cost would fall: chi^2 with 2 degrees of freedom without a load there
     (4)  x_b moves by A_bb^-1 (g_b - A_bc F)
 
+A force at the tip has three components, and its drop 3 degrees of freedom.
 Source: Rao's score test (1948), in the information form of estimation.filter.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..estimation import filter as ekf
+from ..estimation.evaluator import evaluator, normal
 from ..estimation.solve import linearize
 from ..estimation.starts import Origin, Start
 from ..mechanics.loads import GaussianLoads, Load
@@ -88,24 +91,18 @@ def score_test(problem: Problem, x: Float[Tensor, "B n"]) -> ScoreTest:
     fitted = problem.unknowns.loads
     if not isinstance(fitted, GaussianCoordinates):
         raise ValueError(f"score_test: the loads are {type(fitted).__name__}; give a problem with GaussianCoordinates")
-    L, n, g = fitted.length, problem.size, fitted.size
+    L, g = fitted.length, fitted.size
     places = tuple(L * (j + 1) / PLACES for j in range(PLACES))
     wide = problem.of(replace(problem.unknowns, loads=_WithCandidates(fitted, places)))
     nothing = x.new_zeros(len(x), 2 * PLACES)
     # In equilibrium: slack at the tip would take up part of what a weak load does.
     at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), exact=True)
     assert at.tip is not None
-    A, gradient = at.tip.reduced(at.A, at.g)
     c = torch.arange(g, g + 2 * PLACES)
-    b = torch.cat([torch.arange(g), torch.arange(g + 2 * PLACES, n - ekf.BASE + 2 * PLACES)])
-    A_bc = A[:, b][:, :, c]
-    both = ekf.solve_spd(A[:, b][:, :, b], torch.cat([A_bc, gradient[:, b].unsqueeze(-1)], -1))
-    A_cc = A[:, c][:, :, c] - A_bc.mT @ both[..., :-1]
-    g_c = gradient[:, c] - (A_bc.mT @ both[..., -1:]).squeeze(-1)
+    A_cc, g_c, both = _eliminated(*at.tip.reduced(at.A, at.g), c)
     # And how the base wrench follows: T of those that stay, T of the new force, d.
-    follows = torch.cat(
-        [at.tip.T[:, :, c] - at.tip.T[:, :, b] @ both[..., :-1], at.tip.d.unsqueeze(-1) - at.tip.T[:, :, b] @ both[..., -1:]], -1
-    )
+    T_b = at.tip.T[:, :, _all_but(c, at.tip.T.shape[-1])]
+    follows = torch.cat([at.tip.T[:, :, c] - T_b @ both[..., :-1], at.tip.d.unsqueeze(-1) - T_b @ both[..., -1:]], -1)
     both = torch.cat([both, follows], 1)
     pair = 2 * torch.arange(PLACES).unsqueeze(-1) + torch.arange(2)
     S = A_cc[:, pair.unsqueeze(-1), pair.unsqueeze(-2)]
@@ -113,6 +110,36 @@ def score_test(problem: Problem, x: Float[Tensor, "B n"]) -> ScoreTest:
     drop = (F * g_c[:, pair]).sum(-1).nan_to_num(0.0)
     best = drop.argmax(-1)
     return _at_best(best, drop, F, both, pair, x)
+
+
+def drop_by_tip_force(problem: Problem, x: Float[Tensor, "B n"], nu: float = math.inf) -> Float[Tensor, " B"]:
+    """The score test of a force at the tip, at the fit x (B, n) of a problem with nothing unknown there, in the units of
+    Problem.state: (3) is chi^2 with 3 degrees of freedom where there is none. nu: of Student's t, as for `evaluator`.
+    """
+    first, wide = problem.state.tip.at.start, problem.of(replace(problem.unknowns, tip="force"))
+    at = torch.cat([x[:, :first], x.new_zeros(len(x), 3), x[:, first:]], -1)
+    N = normal(wide, evaluator(wide, nu).sums(at)).readings
+    assert N.tip is not None
+    A, g, _ = N.whole(at, wide.mean, wide.precision)
+    S, g_c, _ = _eliminated(*N.tip.reduced(A, g), first + torch.arange(3))
+    return ekf.decrement(S, g_c)
+
+
+def _all_but(new: Int[Tensor, " c"], n: int) -> Int[Tensor, " b"]:
+    """Those of n entries that are not new."""
+    kept = torch.ones(n, dtype=torch.bool)
+    kept[new] = False
+    return kept.nonzero().squeeze(-1)
+
+
+def _eliminated(
+    A: Float[Tensor, "B m m"], g: Float[Tensor, "B m"], new: Int[Tensor, " c"]
+) -> tuple[Float[Tensor, "B c c"], Float[Tensor, "B c"], Float[Tensor, "B b c+1"]]:
+    """Of the new entries, all others free: the information (1), the gradient that (2) begins with, and A_bb^-1 [A_bc, g_b]."""
+    b = _all_but(new, A.shape[-1])
+    A_bc = A[:, b][:, :, new]
+    both = ekf.solve_spd(A[:, b][:, :, b], torch.cat([A_bc, g[:, b].unsqueeze(-1)], -1))
+    return A[:, new][:, :, new] - A_bc.mT @ both[..., :-1], g[:, new] - (A_bc.mT @ both[..., -1:]).squeeze(-1), both
 
 
 def _at_best(

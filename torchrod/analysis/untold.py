@@ -1,10 +1,11 @@
 """Loads that nobody told of, where the number of contacts is told.
 
 A shape that one contact explains may be of a force at the tip that also pulls along the rod, which looks like a contact farther
-down, or of two loads of which the fit has made one. Both are tried: a force at the tip instead of the contact nearest to it, and
-one contact more. By the BIC, with the weights that hypotheses have in analysis.averaging, what is nearly as probable, or of more
-contacts more probable, is named. Where the fit explains nothing, a force at the tip is named that does. The fit that is reported is
-never changed.
+down, of a contact beside such a force, or of two loads of which the fit has made one. All are tried: a force at the tip instead of
+the contact nearest to it, one beside all contacts, and one contact more. By the BIC, with the weights that hypotheses have in
+analysis.averaging, what is nearly as probable, or of more contacts more probable, is named; a force at the tip beside all contacts
+where chi^2 falls by more than it does in one of a hundred shapes without one. Where the fit explains nothing, a force at the tip is
+named that explains the readings. The fit that is reported is never changed.
 """
 
 import math
@@ -23,7 +24,10 @@ from ..model.sensors import TipWrench
 from .alternatives import read_at_few_places
 from .averaging import ONE_MORE
 from .count import CLOSE, MAX_CONTACTS, MOST_BESIDE_TIP, NEAR_TIP, StartFor, always_cold, bic
+from .score_test import drop_by_tip_force
 
+BY_CHANCE = 11.34  # chi^2 with 3 degrees of freedom is above that in 1 %
+LINEAR = 0.8  # a fit is made where the score test promises so much of it
 WEIGH = "--contacts auto weighs both"
 MOST_UNEXPLAINED = 64  # samples without a fit that explains them, for which a force at the tip is tried
 Named = dict[int, tuple[float, str]]  # by sample: by how much the BIC is behind, and the sentence
@@ -45,7 +49,7 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
     rows = (fit.accepted & many).nonzero().squeeze(-1)
     unexplained = (~fit.accepted & many & known).nonzero().squeeze(-1)[:MOST_UNEXPLAINED]
     other = _Others(problem, loads, fit, bic(problem, fit), replace(settings or Settings(), restarts=()), start)
-    named = [*_instead(other, rows).items(), *_beside(other, rows).items()] if len(rows) else []
+    named = [item for kind in (_instead, _beside, _force_beside) for item in kind(other, rows).items()] if len(rows) else []
     for b, (_, words) in sorted(named, key=lambda item: -item[1][0]):  # the likeliest last
         said[b] = words
     for b, words in _explaining(other, unexplained).items():
@@ -107,7 +111,8 @@ def _explaining(others: _Others, rows: Int[Tensor, " b"]) -> dict[int, str]:
 def _force(fit: Estimate, i: int, contacts: int, how: str = "") -> str:
     """What explains a sample of a fit with a force at the tip, and the option for it."""
     assert fit.tip is not None
-    force, beside = ", ".join(f"{v:.3g}" for v in fit.tip[i, :3].tolist()), " beside 1 contact" * contacts
+    force = ", ".join(f"{v:.3g}" for v in fit.tip[i, :3].tolist())
+    beside = f" beside {contacts} contact{'s' * (contacts > 1)}" if contacts else ""
     return f"A force of ({force}) N at the tip{beside} explains the readings{how} (--contacts {contacts} --unknown-tip force)"
 
 
@@ -121,4 +126,18 @@ def _beside(others: _Others, rows: Int[Tensor, " b"]) -> Named:
     for i in (behind < 0).nonzero().squeeze(-1).tolist():
         chi2 = f"chi2 = {float(other.chi2[i]):.3g} instead of {float(others.fit.chi2[rows[i]]):.3g}"
         found[int(rows[i])] = float(behind[i]), f"One contact more explains the readings better ({chi2}); {WEIGH}."
+    return found
+
+
+def _force_beside(others: _Others, rows: Int[Tensor, " b"]) -> Named:
+    """A force at the tip beside all contacts, where chi^2 asks for one."""
+    fit, settings = others.fit, others.settings
+    rows = rows[drop_by_tip_force(others.problem.take(rows), fit.x[rows], settings.robust) > LINEAR * BY_CHANCE]
+    if not len(rows):
+        return {}
+    other, behind = others.of(others.loads.count, "force", rows)
+    found: Named = {}
+    for i in (torch.isfinite(behind) & (fit.cost[rows] - other.cost > BY_CHANCE)).nonzero().squeeze(-1).tolist():
+        better = f" better (chi2 = {float(other.chi2[i]):.3g} instead of {float(fit.chi2[rows[i]]):.3g})"
+        found[int(rows[i])] = float(behind[i]), f"{_force(other, i, others.loads.count, better)}."
     return found
