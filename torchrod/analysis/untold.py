@@ -2,10 +2,10 @@
 
 A shape that one contact explains may be of a force at the tip that also pulls along the rod, which looks like a contact farther
 down, of a contact beside such a force, or of two loads of which the fit has made one. All are tried: a force at the tip instead of
-the contact nearest to it, one beside all contacts, and one contact more. By the BIC, with the weights that hypotheses have in
-analysis.averaging, what is nearly as probable, or of more contacts more probable, is named; a force at the tip beside all contacts
-where chi^2 falls by more than it does in one of a hundred shapes without one. Where the fit explains nothing, a force at the tip is
-named that explains the readings. The fit that is reported is never changed.
+the contact nearest to it, one beside all contacts, and one contact more. The first is named where it is nearly as probable by the
+BIC, the others where chi^2 falls by more than it does in one of a hundred shapes without them; of several those that are nearly as
+probable as the likeliest, with the weights that hypotheses have in analysis.averaging. Where the fit explains nothing, a force at
+the tip is named that explains the readings. The fit that is reported is never changed.
 """
 
 import math
@@ -23,10 +23,10 @@ from ..model.problem import Problem
 from ..model.sensors import TipWrench
 from .alternatives import read_at_few_places
 from .averaging import ONE_MORE
-from .count import CLOSE, MAX_CONTACTS, MOST_BESIDE_TIP, NEAR_TIP, StartFor, always_cold, bic
+from .count import CLOSE, MAX_CONTACTS, MOST_BESIDE_TIP, NEAR_TIP, UNTOLD, StartFor, always_cold, bic
 from .score_test import drop_by_tip_force
 
-BY_CHANCE = 11.34  # chi^2 with 3 degrees of freedom is above that in 1 %
+BY_CHANCE = 11.34  # chi^2 with 3 degrees of freedom is above that in 1 %; the drop by one contact more in 1.0 to 1.4 %
 LINEAR = 0.8  # a fit is made where the score test promises so much of it
 WEIGH = "--contacts auto weighs both"
 MOST_UNEXPLAINED = 64  # samples without a fit that explains them, for which a force at the tip is tried
@@ -36,8 +36,8 @@ Named = dict[int, tuple[float, str]]  # by sample: by how much the BIC is behind
 def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, start: StartFor = always_cold) -> tuple[str, ...]:
     """For every sample a sentence on loads that explain its readings as well as those that were told, or "".
 
-    problem: with Gaussian loads of unknown places, and nothing unknown at the tip; of another there is nothing said, nor of so many
-    contacts that "auto" does not try them. fit: of it. start: the rule that other fits start by.
+    problem: with Gaussian loads of unknown places, and nothing unknown at the tip; of another there is nothing said. fit: of it.
+    start: the rule that other fits start by.
     """
     said = [""] * problem.batch
     loads = problem.unknowns.loads
@@ -49,9 +49,11 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
     rows = (fit.accepted & many).nonzero().squeeze(-1)
     unexplained = (~fit.accepted & many & known).nonzero().squeeze(-1)[:MOST_UNEXPLAINED]
     other = _Others(problem, loads, fit, bic(problem, fit), replace(settings or Settings(), restarts=()), start)
-    named = [item for kind in (_instead, _beside, _force_beside) for item in kind(other, rows).items()] if len(rows) else []
-    for b, (_, words) in sorted(named, key=lambda item: -item[1][0]):  # the likeliest last
-        said[b] = words
+    if len(rows):
+        kinds = _instead(other, rows), _beside(other, rows), _force_beside(other, rows)
+        for b in rows.tolist():
+            found = sorted(kind[b] for kind in kinds if b in kind)
+            said[b] = " ".join(words for behind, words in found if behind < found[0][0] - 2 * math.log(CLOSE))
     for b, words in _explaining(other, unexplained).items():
         said[b] = words
     return tuple(said)
@@ -78,6 +80,14 @@ class _Others:
         other = estimate_each(part, self.settings, self.start(part))
         behind = bic(part, other) - 2 * math.log(share) - self.own[rows]
         return other, torch.where(other.accepted, behind, torch.inf)
+
+    def needed(self, other: Estimate, behind: Float[Tensor, " b"], rows: Int[Tensor, " b"]) -> list[int]:
+        """Of which rows chi^2 asks for other loads, of which these are some more."""
+        return (torch.isfinite(behind) & (self.fit.cost[rows] - other.cost > BY_CHANCE)).nonzero().squeeze(-1).tolist()
+
+    def better(self, other: Estimate, i: int, rows: Int[Tensor, " b"]) -> str:
+        """How much better other loads explain row i."""
+        return f" better (chi2 = {float(other.chi2[i]):.3g} instead of {float(self.fit.chi2[rows[i]]):.3g})"
 
 
 def _instead(others: _Others, rows: Int[Tensor, " b"]) -> Named:
@@ -117,15 +127,14 @@ def _force(fit: Estimate, i: int, contacts: int, how: str = "") -> str:
 
 
 def _beside(others: _Others, rows: Int[Tensor, " b"]) -> Named:
-    """One contact more, where that is more probable than that there is none."""
+    """One contact more, where chi^2 asks for one."""
     more = others.loads.count + 1
     if more > MAX_CONTACTS:
         return {}
     other, behind = others.of(more, "none", rows, ONE_MORE)
     found: Named = {}
-    for i in (behind < 0).nonzero().squeeze(-1).tolist():
-        chi2 = f"chi2 = {float(other.chi2[i]):.3g} instead of {float(others.fit.chi2[rows[i]]):.3g}"
-        found[int(rows[i])] = float(behind[i]), f"One contact more explains the readings better ({chi2}); {WEIGH}."
+    for i in others.needed(other, behind, rows):
+        found[int(rows[i])] = float(behind[i]), f"One contact more explains the readings{others.better(other, i, rows)}; {WEIGH}."
     return found
 
 
@@ -135,9 +144,8 @@ def _force_beside(others: _Others, rows: Int[Tensor, " b"]) -> Named:
     rows = rows[drop_by_tip_force(others.problem.take(rows), fit.x[rows], settings.robust) > LINEAR * BY_CHANCE]
     if not len(rows):
         return {}
-    other, behind = others.of(others.loads.count, "force", rows)
+    other, behind = others.of(others.loads.count, "force", rows, UNTOLD)
     found: Named = {}
-    for i in (torch.isfinite(behind) & (fit.cost[rows] - other.cost > BY_CHANCE)).nonzero().squeeze(-1).tolist():
-        better = f" better (chi2 = {float(other.chi2[i]):.3g} instead of {float(fit.chi2[rows[i]]):.3g})"
-        found[int(rows[i])] = float(behind[i]), f"{_force(other, i, others.loads.count, better)}."
+    for i in others.needed(other, behind, rows):
+        found[int(rows[i])] = float(behind[i]), f"{_force(other, i, others.loads.count, others.better(other, i, rows))}."
     return found
