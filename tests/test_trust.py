@@ -104,4 +104,6 @@ def test_robots_that_are_off():
     cells = robots.measured(("passive: stiffness 10 %", 0.001), 24, 5)[0].split(" | ")
     exact, stated = (int(cell.split("/")[0]) for cell in (cells[3], cells[5]))
     assert exact < 60 < 85 < stated
-    assert robots.counted(("passive: set 0.1/m", 0.0025), 2, 5).startswith("| passive: set 0.1/m | 0.25 |")
+    line, counts = robots.counted(("passive: set 0.1/m", 0.0025), 4, 5)
+    assert line.startswith("| passive: set 0.1/m | 0.25 |")
+    assert counts[1, :3].tolist() == [[0, 4], [4, 4], [4, 4]]  # where the set is stated: nothing, and one push
