@@ -7,6 +7,7 @@ of 0.5 to 1 force scale; its load is estimated once with the robot taken as exac
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -264,7 +265,7 @@ def contact_rows() -> list[Row]:
     frame = Registration(5e-4, math.radians(0.3))
     for name, robot in (("passive", passive), ("one tendon", one), ("three tendons", three)):
         off = {"stiffness 3 %": _stiffness(0.03), "mass 5 %": _mass(0.05), "set 0.1/m": _set(0.1)}
-        stated = {"stiffness": 0.03, "mass": 0.05, "set": 0.1}
+        stated: dict[str, Any] = {"stiffness": 0.03, "mass": 0.05, "set": 0.1}
         if len(robot.tendons):
             off |= {"tension 3 %": _gain(0.03), "friction 0.1": _friction(0.1)}
             stated |= {"tension": 0.03, "friction": 0.1}
