@@ -349,6 +349,33 @@ def test_a_calibrated_robot_estimates_better(tmp_path):
     assert error[robot][0] > 3 * error[out][0]
 
 
+STANDING = """[rod]
+length = 0.3
+diameter = 0.0018
+inner_diameter = 0.0014
+youngs_modulus = 60e9
+shear_modulus = 23e9
+mass_per_length = 0.0065
+gravity = [0, 0, -9.81]
+"""
+
+
+@pytest.mark.parametrize("push", [(0.18, 0.4, 0.2), (0.1, 1.0, 0.0), (0.27, -0.3, 0.1)])
+@pytest.mark.many_fits
+def test_a_shape_that_something_pushes_calibrates_nothing(tmp_path, capsys, push):
+    """It once came to hundreds of kg/m, known to a millionth, with a chi^2 of -1e137, and was written."""
+    (tmp_path / "upright.toml").write_text(STANDING)
+    robot, s = read_robot(tmp_path / "upright.toml"), torch.linspace(0.025, 0.3, 12)
+    p = solve_shape(robot, (PointForces(T([[[*push[1:], 0.0]]]), T([[push[0]]])),), None, s, 1).p
+    positions = p + 5e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(1))
+    path, shapes = files(tmp_path, STANDING, Shapes(s, positions, ["0"]))
+    out = tmp_path / "out.toml"
+    assert main(["calibrate", path, shapes, "--noise", "5e-4", "--out", str(out)]) == 0
+    captured = capsys.readouterr()
+    assert "out.toml: not written" in captured.err and not out.exists()
+    assert "Converged." not in captured.out and "chi2/dof -" not in captured.out
+
+
 PASSIVE = "[rod]\nlength = 0.4\ndiameter = 0.0014\nyoungs_modulus = 207e9\nshear_modulus = 79e9\ngravity = [9.81, 0, 0]\n"
 PULLED = PASSIVE + "[[tendons]]\noffset = [0.007, 0.0]\n"
 STRAIGHT = "s,x,y,z\n" + "".join(f"{0.1 * i:g},{0.01 * i * i:g},0,{0.1 * i:g}\n" for i in range(1, 5))

@@ -211,6 +211,19 @@ def check_agreement(problem: Problem, x: torch.Tensor) -> None:
     assert close(definition.cost(x), cost)
 
 
+def test_no_cost_is_less_than_nothing():
+    """Far from an equilibrium the second order of a step once took off more than there was, and such a fit was the best of all."""
+    problem, x = case(steel_rod(), GaussianCoordinates(2, 0.4, 1.0), registration=Registration(), tip="force")
+    evaluate = KernelEvaluator(problem)
+    sums = evaluate.sums(x)
+    sums.g[1:3] *= 1e3
+    equations, prior = normal(problem, sums), (problem.mean, problem.precision)
+    at_x = equations.readings.whole(x, *prior)[2]
+    for cost in (equations.posterior(x, *prior, exact=True)[1], evaluate.posterior(sums, x)[1]):
+        assert torch.allclose(cost[1:3], at_x[1:3], rtol=1e-12)
+        assert bool((cost >= 0).all()) and not torch.allclose(cost[3:], at_x[3:], rtol=1e-3)
+
+
 def test_the_covariance():
     """KernelEvaluator.posterior against Normal.posterior, also where the normal equations have no inverse or are not finite."""
     problem, x = case(steel_rod(), GaussianCoordinates(2, 0.4, 1.0), registration=Registration(), tip="force")

@@ -31,6 +31,7 @@ from ..util.errors import InputError
 from ..util.status import Status
 from .arguments import noise_std, positive, writable
 
+FAR_OFF = 0.05  # of the length: no noise, and no robot like that of the file
 USED = {"position_std", "hung", "hung_at"}
 
 
@@ -123,6 +124,11 @@ def _write_robot(options: Namespace, robot: Robot, found: Calibration, shapes: S
     """The calibrated robot file; none where the calibration has nothing to say."""
     if found.status is not Status.CONVERGED or found.undetermined:
         warnings.warn(f"{options.out}: not written, because the values are not known; see the message", stacklevel=2)
+        return
+    off = found.rms_residual / robot.rod.length
+    if not found.accepted and off > FAR_OFF:
+        far = f"the calibrated robot is still {1e3 * found.rms_residual:.3g} mm off, {100 * off:.0f} % of its length"
+        warnings.warn(f"{options.out}: not written, because {far}; see the message", stacklevel=2)
         return
     factor, offsets = found.value(STIFFNESS, 1.0), any(name.startswith(OFFSET) for name in found.names)
     calibrated = calibrated_by(found, options.noise, shapes.s if options.marker_offsets else None)

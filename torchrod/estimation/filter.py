@@ -219,7 +219,8 @@ class Normal:
         """Covariance of the estimate, with the true noise and c = 0, and the cost with the prior.
 
         exact: the cost where the step under (7) leads, to second order; at x the tip may still be a little out of balance, which
-        can look cheaper than any equilibrium. Otherwise the cost at x, that of c included.
+        can look cheaper than any equilibrium. Where that is no cost, far from an equilibrium, that of the readings at x. Otherwise
+        the cost at x, that of c included.
         """
         assert self.tip is not None
         A, g, cost = self.readings.whole(x, mean, precision)
@@ -227,7 +228,7 @@ class Normal:
         step, C = self.tip.solve(A, g)
         onward = cost - 2 * (g * step).sum(-1) + square(A, step)
         C = torch.where(finite[:, None, None], C, torch.nan)
-        return C, torch.where(torch.isfinite(onward), onward, cost) if exact else cost + self.cost[:, 1]
+        return C, torch.where(torch.isfinite(onward) & (onward >= 0), onward, cost) if exact else cost + self.cost[:, 1]
 
 
 def student(

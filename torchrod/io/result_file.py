@@ -5,7 +5,7 @@ import io
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
@@ -270,11 +270,13 @@ def _texts(result: Result) -> Iterator[str]:
 
 def _load_table(result: Result) -> str:
     """A row for each load of each sample, the tip's last, and one for a sample without any."""
-    of = _columns(replace(result, intervals=None))
+    of = _columns(result)
     vectors = {"force_local_N": "force", **{name: name for name in SPACE if name in of}}
     parts = {name: "xyz"[: 2 if name == "force_local_N" else 3] for name in vectors}
     single = LOAD_NUMBERS | {name: WITH_UNITS[name] for name in AXIAL if WITH_UNITS[name] in of}
+    ends = {"magnitude_N": "magnitude_interval", "location_m": "location_interval"}
     header = ["time_s", "sample", "status", "accepted", "load", *single]
+    header += [f"{name.rpartition('_')[0]}_{end}_{name.rpartition('_')[2]}" for name in ends for end in ("low", "high")]
     header += [f"{name.rpartition('_')[0]}_{axis}_{name.rpartition('_')[2]}" for name, axes in parts.items() for axis in axes]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -284,6 +286,7 @@ def _load_table(result: Result) -> str:
         loads = [k for k, v in enumerate(of["location"][b]) if not math.isnan(v)]
         for k in loads:
             numbers = [of[field][b][k] for field in single.values()]
+            numbers += [v for field in ends.values() for v in of[field][b][k]]
             numbers += [v for field in vectors.values() for v in of[field][b][k]]
             writer.writerow([*head, k + 1, *("" if math.isnan(v) else v for v in numbers)])
         tip = {f"force_base_{axis}_N": v for axis, v in zip("xyz", of["tip"][b], strict=False)} if "tip" in of else {}

@@ -114,7 +114,7 @@ void torchrod_posterior(const Sums* sums, const double* x, const Table* mean, co
         const TipCondition tip(n, condition, room);
         V onward = total + tip.solve(A, g, reduced, g_y, factor, middle, step, [&](const Inverse& inverse) { tip.spread(inverse, reduced, found); });
         for (int64_t i = 0; i < n; i++) onward -= 2.0 * g[i] * step[i];
-        if (exact) total = select(finite(onward), onward, total);
+        if (exact) total = select(finite(onward) & (onward >= 0.0), onward, total);
         else total += fetch({sums->cost, 2}, lanes, 1);
         for (int64_t l = 0; l < lanes.count; l++) {
             const int64_t b = lanes.sample[l];
