@@ -108,6 +108,36 @@ def test_beside_a_told_contact_a_force_at_the_tip_is_named_where_chi2_asks_for_i
     assert share["alone"] < 0.04 and share["beside"] > 0.3
 
 
+@pytest.mark.study
+@pytest.mark.parametrize("contacts", [1, "auto"])
+def test_a_load_that_is_spread_along_the_rod_is_named_where_one_contact_explains_it(contacts):
+    """A contact makes too little of its force, by ten standard deviations, and was accepted in silence. Of pushes 5 % are named."""
+    random, B = torch.Generator().manual_seed(10), 40 if contacts == "auto" else 80
+    turn, size = 6.3 * torch.rand(B, 1, generator=random, dtype=torch.float64), 0.6
+    t = (torch.arange(100, dtype=torch.float64) + 0.5) / 100
+    way = torch.stack([turn.cos(), turn.sin(), 0 * turn], -1)
+    even = tr.PointForces(size / 100 * way.expand(-1, 100, -1), (0.1 + 0.28 * t).expand(B, -1))
+    share = {}
+    for name, loads in (("even", even), ("push", tr.PointForces(size * way, torch.full((B, 1), 0.24)))):
+        problem = posed(S, noisy(tr.solve_shape(steel_rod(), (loads,), None, S, B, 160).p, 4e-4), 4e-4)
+        a = analyze(problem, contact_hypotheses(problem, contacts), named=True)
+        said = torch.tensor(["One load spread along the rod" in a.message(b) for b in range(B)])
+        share[name] = float(said[a.estimate.accepted].double().mean())
+        if contacts == 1 and name == "even":
+            wrong = (a.estimate.magnitude_interval[:, 0, 1] < size) & a.estimate.accepted
+            assert float(wrong.double().mean()) > 0.6
+    assert share["even"] > 0.7 and share["push"] < 0.13
+
+
+def test_where_a_spread_load_competes_it_is_not_named_again():
+    way = torch.tensor([[[1.0, 0.0, 0.0]]], dtype=torch.float64)
+    even = tr.PointForces(0.006 * way.expand(3, 100, 3), (0.1 + 0.0028 * torch.arange(100, dtype=torch.float64)).expand(3, -1))
+    problem = posed(S, noisy(tr.solve_shape(steel_rod(), (even,), None, S, 3, 160).p, 4e-4), 4e-4)
+    for prior, named in (("contact", True), ("distributed", False)):
+        a = analyze(problem, contact_hypotheses(problem, 1, prior), named=True)
+        assert any("spread along" in a.message(b) for b in range(3)) == named
+
+
 def test_where_nothing_or_one_contact_is_surely_right_no_force_at_the_tip_is_named():
     """On an unloaded rod a contact near the tip, and a pull there, explain noise alike."""
     p = tr.solve_shape(steel_rod(), (), None, S, 40, 80).p

@@ -39,7 +39,7 @@ from .count import (
 from .diagnosis import Diagnosis, diagnose
 from .noise import Noise, estimate_noise_among, with_noise
 from .patterns import Pattern, joined_diagnosis, joined_estimate, joined_evidence, joined_intervals, joined_noise, part_of, patterns
-from .untold import untold
+from .untold import NARROW, spread, untold
 
 SMOOTH_DEVIATIONS, SMOOTH_CORRELATIONS = (0.5, 2.0, 8.0), (0.1, 0.4)  # force scales / L, lengths
 
@@ -149,8 +149,9 @@ def analyze(
     registration of scope SHARED is found from all samples. start: the rule that the fits of a hypothesis start by. bar: shows
     progress, called with a total and a name. sampled: intervals and bands from draws of the posterior (estimation.draws), and the
     choice among hypotheses by their probabilities (analysis.averaging); not where all samples share a base frame, whose error the
-    draws of one sample cannot have. named: where the number of contacts is told, what nobody told of is named if it explains the
-    readings as well (analysis.untold), by two or three fits more. Errors: ValueError as torchrod.estimate.
+    draws of one sample cannot have. named: what nobody told of is named if it explains the readings as well (analysis.untold), by a
+    few fits more: other loads where the number of contacts is told, and one spread along the rod where none competes.
+    Errors: ValueError as torchrod.estimate.
     """
     registration = problem.unknowns.registration
     split = patterns(problem) if registration is None or registration.scope is not Scope.SHARED else []
@@ -200,10 +201,14 @@ def analyze(
         problem = problem.of(parts[0][0])
     found = found if noise is None else noise.judged(found)
     diagnosis = replace(diagnose(problem, found, settings, parts), others=other_solutions(problem, found, parts, settings))
+    rivals = []
     if evidence is not None and evidence.probability is not None:
-        diagnosis = replace(diagnosis, rivals=tuple(evidence.rival(b) for b in range(problem.batch)))
+        rivals.append([evidence.rival(b) for b in range(problem.batch)])
     elif named and evidence is None:
-        diagnosis = replace(diagnosis, rivals=untold(problem, found, settings, start))
+        rivals.append(untold(problem, found, settings, start))
+    if named and all(getattr(c.unknowns.loads, "prior_name", "") in NARROW for c in competing):
+        rivals.append(spread(problem, found, parts, settings, start))
+    diagnosis = replace(diagnosis, rivals=tuple(" ".join(filter(None, words)) for words in zip(*rivals, strict=True)))
     if sampled and not shared and drawn is None:
         drawn = sampled_intervals(problem, found, parts, nu=settings.robust)
     return Analysis(problem, found, parts, evidence, noise, frame, diagnosis, drawn)

@@ -1,4 +1,4 @@
-"""Loads that nobody told of, where the number of contacts is told.
+"""Loads that nobody told of: others where the number of contacts is told, and one spread along the rod where all are narrow.
 
 A shape that one contact explains may be of a force at the tip that also pulls along the rod, which looks like a contact farther
 down, of a contact beside such a force, or of two loads of which the fit has made one. All are tried: a force at the tip instead of
@@ -6,17 +6,20 @@ the contact nearest to it, one beside all contacts, and one contact more. The fi
 BIC, the others where chi^2 falls by more than it does in one of a hundred shapes without them; of several those that are nearly as
 probable as the likeliest, with the weights that hypotheses have in analysis.averaging. Where the fit explains nothing, a force at
 the tip is named that explains the readings. The fit that is reported is never changed.
+
+One contact, or two, explain many a load that is spread over a part of the rod, and make too little of its force. Where one spread
+load is more probable than the contacts, it is named.
 """
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..estimation.result import Estimate
+from ..estimation.shared import Parts
 from ..estimation.solve import Settings, estimate_each
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
@@ -28,6 +31,9 @@ from .score_test import drop_by_tip_force
 
 BY_CHANCE = 11.34  # chi^2 with 3 degrees of freedom is above that in 1 %; the drop by one contact more in 1.0 to 1.4 %
 LINEAR = 0.8  # a fit is made where the score test promises so much of it
+NARROW = "point", "contact"  # priors of a width
+MORE = 2.0  # times as probable; of single pushes 2 to 5 % come to that by chance
+MOST_ODDS = 1000.0  # that are told
 WEIGH = "--contacts auto weighs both"
 MOST_UNEXPLAINED = 64  # samples without a fit that explains them, for which a force at the tip is tried
 Named = dict[int, tuple[float, str]]  # by sample: by how much the BIC is behind, and the sentence
@@ -59,6 +65,31 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
     return tuple(said)
 
 
+def spread(
+    problem: Problem, fit: Estimate, parts: Parts, settings: Settings | None = None, start: StartFor = always_cold
+) -> tuple[str, ...]:
+    """For every sample a sentence on one load spread along the rod that is more probable than its contacts, or "".
+
+    fit: of the problem with the unknowns of each of the parts. start: the rule that other fits start by.
+    """
+    said = [""] * problem.batch
+    for unknowns, index in parts:
+        loads, own = unknowns.loads, problem.of(unknowns)
+        if not isinstance(loads, GaussianCoordinates) or not loads.count or loads.locations is not None:
+            continue
+        rows = index[(fit.accepted & ~read_at_few_places(own))[index]]
+        if loads.prior_name not in NARROW or not len(rows):
+            continue
+        wide = replace(loads, prior_name="distributed")
+        others = _Others(own, wide, fit, bic(own, fit), replace(settings or Settings(), restarts=()), start)
+        other, behind = others.of(1, unknowns.tip, rows)
+        for i in (behind < -2 * math.log(MORE)).nonzero().squeeze(-1).tolist():
+            odds = f"{min(math.exp(-0.5 * float(behind[i])), MOST_ODDS):.2g}"
+            load = f"{float(other.magnitude[i, 0]):.3g} N about s = {1e3 * float(other.location[i, 0]):.3g} mm"
+            said[int(rows[i])] = f"One load spread along the rod ({load}) is {odds} times as probable; try --load-prior auto."
+    return tuple(said)
+
+
 @dataclass(frozen=True)
 class _Others:
     """Fits of other loads than those of a problem and its fit, of a BIC `own` (B,)."""
@@ -70,9 +101,7 @@ class _Others:
     settings: Settings
     start: StartFor
 
-    def of(
-        self, contacts: int, tip: Literal["none", "force"], rows: Int[Tensor, " b"], share: float = 1.0
-    ) -> tuple[Estimate, Float[Tensor, " b"]]:
+    def of(self, contacts: int, tip: str, rows: Int[Tensor, " b"], share: float = 1.0) -> tuple[Estimate, Float[Tensor, " b"]]:
         """The fit of other loads to some samples, and by how much its BIC, that of a hypothesis with a share, is behind."""
         part = self.problem.of(replace(self.problem.unknowns, loads=replace(self.loads, count=contacts), tip=tip)).take(rows)
         if not part.determined:

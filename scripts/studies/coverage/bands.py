@@ -94,15 +94,26 @@ class Held:
     cpu: float
 
 
-def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) -> Held:
-    """Of so many loads."""
+@dataclass(frozen=True)
+class Truth:
+    """Of B loads. density: (B, T, 2) N/m at s / L; net (B,) N, of the side that a load pushes to; place (B,) m, of its moment;
+    whole (B,) N, the resultant.
+    """
+
+    density: Callable[[Tensor], Tensor]
+    net: Tensor
+    place: Tensor
+    whole: Tensor
+
+
+def posed(form: Form, noise: float, cases: int, seed: int = 1) -> tuple[tr.Problem, Truth]:
+    """So many loads, one contact told."""
     robot, generator = steel_rod(), torch.Generator().manual_seed(seed)
     rod = robot.rod
     L, size, turn = rod.length, rod.force_scale * _uniform(generator, *SIZE, cases), _uniform(generator, 0, 2 * math.pi, cases)
     state = generator.get_state()
 
     def density(t: Tensor) -> Tensor:
-        """(B, T, 2) N/m at s / L."""
         generator.set_state(state)
         found = form(t, generator, cases)
         if found.ndim == 2:
@@ -115,18 +126,23 @@ def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) ->
     shape = tr.solve_shape(robot, (tr.PointForces(forces, (L * t).expand(cases, -1)),), None, s, cases, STEPS)
     p = shape.p + noise * L * torch.randn(shape.p.shape, generator=generator, dtype=torch.float64)
     unknowns = tr.Unknowns(tr.GaussianCoordinates(1, L, rod.force_scale))
-    problem = tr.Problem(robot, unknowns, [tr.Markers(s, p, noise * L)])
+    along = forces[..., 0] * turn.cos() + forces[..., 1] * turn.sin()
+    truth = Truth(density, along.sum(-1).abs(), (along * L * t).sum(-1) / along.sum(-1), shape.base_wrench[:, :3].norm(dim=-1))
+    return tr.Problem(robot, unknowns, [tr.Markers(s, p, noise * L)]), truth
+
+
+def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) -> Held:
+    """Of so many loads."""
+    problem, truth = posed(form, noise, cases, seed)
     begun = time.process_time()
     found = tr.analyze(problem, tr.contact_hypotheses(problem, "auto" if prior == "auto" else 1, prior), sampled=True)
     cpu = time.process_time() - begun
     assert found.profile is not None and found.intervals is not None
-    f, (low, high) = density(found.profile.s / L).norm(dim=-1), found.profile.band[..., 2, :].unbind(-1)
-    peak = f.amax(-1, keepdim=True)
-    whole, interval = shape.base_wrench[:, :3].norm(dim=-1), found.intervals.resultant[:, 3]
-    inside = (low <= f) & (f <= high)
-    # All of a load pushes one way, or the other.
-    along = forces[..., 0] * turn.cos() + forces[..., 1] * turn.sin()
-    net, place = along.sum(-1), (along * L * t).sum(-1) / along.sum(-1)
+    f, (low, high) = (
+        truth.density(found.profile.s / problem.robot.rod.length).norm(dim=-1),
+        found.profile.band[..., 2, :].unbind(-1),
+    )
+    peak, inside = f.amax(-1, keepdim=True), (low <= f) & (f <= high)
     one = torch.zeros(cases, dtype=torch.bool)
     for unknowns, rows in found.parts:
         one[rows] = unknowns.tip == "none" and getattr(unknowns.loads, "count", 1) == 1
@@ -137,9 +153,9 @@ def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) ->
 
     return Held(
         float(inside[f > LEAST * peak].double().mean()),
-        held(whole, interval, torch.ones_like(one)),
-        held(net.abs(), found.intervals.magnitude[:, 0], one),
-        held(place, found.intervals.location[:, 0], one),
+        held(truth.whole, found.intervals.resultant[:, 3], torch.ones_like(one)),
+        held(truth.net, found.intervals.magnitude[:, 0], one),
+        held(truth.place, found.intervals.location[:, 0], one),
         float(((high - low).mean(-1) / peak.squeeze(-1)).median()),
         cpu / cases,
     )

@@ -7,6 +7,7 @@ import torch
 
 import torchrod as tr
 
+from . import bands
 from .cases import COUNTED, TOLD, Kind, posed
 from .told import share
 
@@ -23,12 +24,15 @@ HEAD = [
 ]
 
 
+SPREAD = "uniform over 30 % of the rod", "uniform over 60 %", "ramp", "half sine"
+
+
 def _beside(force: tuple[float, float], noise: float) -> Kind:
     name = f"push beside a force of {force[0]:g} to {force[1]:g} scales at the tip, {100 * noise:g} % noise"
     return Kind(name, 1, noise, (0.3, 1.0), tip="force", size=force)
 
 
-ROWS: dict[str, tuple[Kind, int]] = {
+ROWS: dict[str, tuple[Kind | str, int]] = {
     "one": (TOLD["one"], 1),
     "one-exact": (TOLD["one-exact"], 1),
     "two": (TOLD["two"], 2),
@@ -40,6 +44,7 @@ ROWS: dict[str, tuple[Kind, int]] = {
     "weak-noisy": (_beside((0.1, 0.5), 2.5e-3), 1),
     "strong": (_beside((0.3, 1.0), 1e-3), 1),
     "strong-noisy": (_beside((0.3, 1.0), 2.5e-3), 1),
+    **{row: (row, 1) for row in bands.ROWS if row.rsplit(", ", 1)[0] in SPREAD},
     "two-as-one": (TOLD["two"], 1),
     "close-as-one": (TOLD["close"], 1),
     "opposed-as-one": (TOLD["opposed"], 1),
@@ -50,7 +55,13 @@ ROWS: dict[str, tuple[Kind, int]] = {
 def line(name: str, cases: int) -> str:
     """One line of the table."""
     kind, contacts = ROWS[name]
-    problem, truth = posed(kind, cases, seed=2)
+    if isinstance(kind, str):
+        form, noise = kind.rsplit(", ", 1)
+        problem, truth = bands.posed(bands.FORMS[form], float(noise.removesuffix(" %")) / 100, cases, seed=2)
+        what, couple = f"one load, {form}, {noise} noise", False
+    else:
+        problem, truth = posed(kind, cases, seed=2)
+        what, couple = kind.name, kind.tip == "moment"
     rod = problem.robot.rod
     loads = tr.GaussianCoordinates(contacts, rod.length, rod.force_scale)
     problem = problem.of(replace(problem.unknowns, loads=loads))
@@ -63,10 +74,10 @@ def line(name: str, cases: int) -> str:
     inside = (truth.whole >= whole[:, 0]) & (truth.whole <= whole[:, 1])
     named = torch.tensor([bool(words) for words in result.diagnosis.rivals])
     said = torch.tensor([bool(result.diagnosis.message(b)) for b in range(cases)])
-    held = share(truth.whole, whole, accepted) if accepted.any() and kind.tip != "moment" else "-"
+    held = share(truth.whole, whole, accepted) if accepted.any() and not couple else "-"
     alarms = f"{100 * float(named[accepted].double().mean()):.1f}" if accepted.any() else "-"
     silent = 100 * float((accepted & ~inside & ~said).double().mean())
     return (
-        f"| {kind.name} | {contacts} | {cases} | {100 * float(accepted.double().mean()):.1f} | {held} | {alarms} | {silent:.1f} "
+        f"| {what} | {contacts} | {cases} | {100 * float(accepted.double().mean()):.1f} | {held} | {alarms} | {silent:.1f} "
         f"| {spent:.1f} |"
     )
