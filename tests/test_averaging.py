@@ -211,7 +211,7 @@ def test_a_load_of_any_form_is_told_of_in_words():
     names = ("0", "1 contact", "2 contact", "1 smooth(0.1 L, 2)", "1 smooth(0.4 L, 2)")
     shares = T([[0.0, 0.0, 0.01, 0.5, 0.49], [0.0, 0.97, 0.01, 0.01, 0.01], [0.0, 0.0, 0.0, 0.3, 0.7]])
     evidence = Evidence(names, torch.tensor([2, 1, 4]), shares, shares, frozenset(), shares)
-    assert evidence.rival(0) == "One load of any form along the rod explains them too: it may be spread."
+    assert evidence.rival(0) == "One load of any form along the rod explains the readings too: what is there may be spread."
     assert not evidence.rival(1)
     assert "told is one load of any form" in evidence.rival(2) and "try --contacts auto" in evidence.rival(2)
     alone = Evidence(names[3:], torch.tensor([1]), shares[2:, 3:], shares[2:, 3:], frozenset(), shares[2:, 3:])

@@ -1,5 +1,6 @@
 """The command line as a user meets it: the reference shapes, the files, and what it says of bad input."""
 
+import csv
 import io
 import json
 import math
@@ -21,12 +22,14 @@ from torchrod import (
     PointCoordinates,
     PointForces,
     Problem,
+    Shapes,
     Unknowns,
     bounds,
     estimate,
     read_robot,
     read_shapes,
     solve_shape,
+    write_shapes,
 )
 from torchrod.analysis.marker_placement import even_layout
 from torchrod.cli import main
@@ -117,8 +120,9 @@ def test_a_result_is_drawn_on_its_own_robot_and_shapes_only(tmp_path, monkeypatc
         assert main(["plot", "other.toml", "s.csv", result, "--out", "p.png"]) == 2
         expected = f"torchrod: {result}: is of robot {name!r}, not of 'other'; give the robot that was estimated\n"
         assert capsys.readouterr().err == expected
-    assert main(["plot", "r.toml", "fewer.csv", "e.npz", "--out", "p.png"]) == 2
-    assert "is of 4 markers, not of 3; give the shapes" in capsys.readouterr().err
+    for result in ("e.npz", "e.json"):
+        assert main(["plot", "r.toml", "fewer.csv", result, "--out", "p.png"]) == 2
+        assert "is of 4 markers, not of 3; give the shapes" in capsys.readouterr().err
     Path("e.json").write_text(Path("e.json").read_text().replace(f'"robot": "{name}", ', ""))
     assert main(["plot", "other.toml", "s.csv", "e.json", "--out", "p.png"]) == 0
 
@@ -226,7 +230,7 @@ BAD = {
     "not toml": ("length = = 3", STRAIGHT, [], "(Invalid value (at line 1, column 10)); correct that place"),
     "name": ("name = [1, 2]\n" + ROD.split("\n", 1)[1], STRAIGHT, [], "robot.toml: name is [1, 2]; it must be a text"),
     "no rod": ("name = 'x'", STRAIGHT, [], "has no [rod] table"),
-    "unknown key": (ROD.replace("diameter", "diametre"), STRAIGHT, [], "unknown key 'diametre'"),
+    "unknown key": (ROD.replace("diameter", "diametre"), STRAIGHT, [], "unknown key 'diametre'; is it diameter? known keys"),
     "missing key": (ROD.replace("diameter", "#"), STRAIGHT, [], "rod.diameter is missing"),
     "negative number": (ROD.replace("diameter = ", "diameter = -"), STRAIGHT, [], "must be positive"),
     "infinite number": (ROD.replace("youngs_modulus = 207000000000.0", "youngs_modulus = inf"), STRAIGHT, [], "must be finite"),
@@ -237,7 +241,16 @@ BAD = {
     "header only": (ROD, "s,x,y,z\n", [], "no rows"),
     "no z": (ROD, "s,x,y\n0.1,0,0\n", [], "column 'z' is missing"),
     "column twice": (ROD, "s,x,y,z,z\n0.1,0,0,0.1,0.1\n", [], "column 'z' stands twice"),
-    "column misspelt": (ROD, "s,x,y,z,base_f_x\n0.1,0,0,0.1,0\n", [], "unknown column 'base_f_x'; call it 'base_fx'"),
+    "column misspelt": (
+        ROD,
+        "s,x,y,z,base_f_x\n0.1,0,0,0.1,0\n",
+        [],
+        "unknown column 'base_f_x'; if it is 'base_fx', call it that",
+    ),
+    "gravity above [rod]": ("gravity = [0, 0, -9.81]\n" + ROD, STRAIGHT, [], "gravity stands outside of [rod]; put it below"),
+    "Poisson's ratio": (ROD + "poisson_ratio = 0.3\n", STRAIGHT, [], "give shear_modulus = E / (2 (1 + nu))"),
+    "thicker than long": (ROD.replace("0.0014", "1.4"), STRAIGHT, [], "1.4 m across, more than the rod's length"),
+    "a turn in degrees": (ROD + "[base]\nrotation = [0, 90, 0]\n", STRAIGHT, [], "turns by 90 rad, more than once around"),
     "half a rotation": (ROD, "s,x,y,z,qx,qw\n0.1,0,0,0.1,0,1\n", [], "column 'qy' is missing; qx,qy,qz,qw come together"),
     "no rotation": (ROD, "s,x,y,z,qx,qy,qz,qw\n0.1,0,0,0.1,0,0,0,2\n", [], "a rotation is a unit quaternion"),
     "text in a cell": (ROD, STRAIGHT + "0.4,a,0,0\n", [], "line 6, column x: 'a' is not a number"),
@@ -262,7 +275,12 @@ BAD = {
     "checkpoint": (ROD, STRAIGHT, ["--warm-start", "x.safetensors"], "torchrod: x.safetensors: no such file"),
     "noise below round-off": (ROD, STRAIGHT, ["--noise", "1e-200"], "from 1e-9 to 1"),
     "locations twice": (ROD, STRAIGHT, ["--location", "0.2", "0.2"], "give it once"),
-    "locations and contacts": (ROD, STRAIGHT, ["--contacts", "1", "--location", "0.1", "0.2"], "one --location per load"),
+    "locations and contacts": (
+        ROD,
+        STRAIGHT,
+        ["--contacts", "1", "--location", "0.1", "0.2"],
+        "--location names 2 places; give one place per load",
+    ),
     "huge number": (ROD.replace("length = 0.4", "length = " + "1" * 400), STRAIGHT, [], "must be finite"),
     "asymmetric stiffness": (
         SOFT.format(K_bt="[[1e-9, 5e-10, 0], [0, 1e-9, 0], [0, 0, 1e-9]]"),
@@ -432,7 +450,10 @@ IDLE = {
     "--base-noise": (["--base-noise", "1", "1"], "has no base wrenches base_fx, .."),
     "--tension-std": (["--tension-std", "1"], "has no tendons"),
     "--load-prior": (["--load-prior", "point", "--contacts", "0"], "--contacts 0 leaves no load"),
-    "--intervals sampled": (["--intervals", "sampled", "--out", "loads.csv"], "name one by --out or --plot"),
+    "--intervals sampled": (
+        ["--intervals", "sampled", "--registration", "--one-frame"],
+        "the error of a base frame that all share",
+    ),
     "--profile on": (["--profile", "on"], "only RESULT.json and RESULT.npz have profiles"),
 }
 
@@ -451,6 +472,27 @@ def test_options_with_nothing_to_act_on_are_told(tmp_path, capsys, monkeypatch, 
     assert f"warning: {option} has no effect: " in said and why in said and said.count("\n") == 1
     assert main(["estimate", "robot.toml", "shapes.csv", "--steps", "5", "--contacts", "0"]) == 0
     assert "no effect" not in capsys.readouterr().err
+
+
+def test_the_intervals_are_the_same_whatever_is_written(tmp_path, capsys, monkeypatch):
+    """Of draws by default, in the table, in LOADS.csv and in RESULT.json; those of a weak push are three times as wide."""
+    monkeypatch.chdir(tmp_path)
+    Path("r.toml").write_text(ROD)
+    s = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
+    push = PointForces(torch.tensor([[[0.15, 0.0, 0.0]]]), torch.tensor([[0.06]]))
+    p = solve_shape(read_robot("r.toml"), (push,), None, s, 1).p
+    write_shapes("s.csv", Shapes(s, p + 1e-3 * torch.randn(p.shape, generator=torch.Generator().manual_seed(1)), ["0"]))
+    tables = []
+    for out in ([], ["--out", "r.csv"], ["--out", "r.json"]):
+        assert main(["estimate", "r.toml", "s.csv", "--noise", "1e-3", *out]) == 0
+        tables.append(capsys.readouterr().out)
+    assert tables[0] == tables[1] == tables[2]
+    (row,) = csv.DictReader(Path("r.csv").read_text().splitlines())
+    (load,) = json.loads(Path("r.json").read_text())["results"][0]["loads"]
+    ends = [float(row[f"magnitude_{end}_N"]) for end in ("low", "high")]
+    assert ends == load["interval_95"]["magnitude_N"]
+    assert f"+- {(ends[1] - ends[0]) / 3.92:.2f}" in tables[0]
+    assert abs((ends[1] - ends[0]) / 3.92 - float(row["magnitude_std_N"])) > 0.1 * float(row["magnitude_std_N"])
 
 
 def test_a_table_of_loads_is_not_drawn(tmp_path, capsys):

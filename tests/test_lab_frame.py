@@ -120,6 +120,9 @@ def test_loads_in_the_robots_and_in_the_labs_frame(tmp_path):
         assert np.allclose(load["force_lab_N"], turn.apply(load["force_base_N"]), atol=1e-12)
         assert np.allclose(load["position_lab_m"], turn.apply(load["position_m"]) + origin, atol=1e-12)
         assert record["time_s"] == arrays["time_s"][b] == float(row["time_s"]) == [0.25, 0.5][b]
+        for name, unit in (("magnitude", "N"), ("location", "m")):
+            ends = [float(row[f"{name}_{end}_{unit}"]) for end in ("low", "high")]
+            assert ends == pytest.approx(load["interval_95"][f"{name}_{unit}"])
         for name in ("force_base_N", "position_m", "force_lab_N", "position_lab_m", "force_local_N"):
             quantity, _, unit = name.rpartition("_")
             in_row = [float(row[f"{quantity}_{axis}_{unit}"]) for axis in "xyz"[: len(load[name])]]

@@ -504,7 +504,7 @@ def test_few_samples_are_drawn_by_default_where_tendons_may_rub_and_the_metric_i
     robot = busy_robot()
     unknowns = unknowns_of(robot, uncertainty=Uncertainty(friction=0.1, metric=0.01))
     problem = Problem(robot, unknowns, [Markers(S, torch.zeros(batch, 20, 3), 1e-3)], torch.ones(batch, 2))
-    options = Namespace(out="r.json", plot=None, intervals=None, one_frame=False)
+    options = Namespace(intervals=None, one_frame=False)
     with nullcontext() if drawn else pytest.warns(UserWarning, match="intervals of 11 samples are those of the covariance"):
         assert _sampled(options, problem, False) is drawn
 

@@ -34,7 +34,7 @@ TOLD_ANY_FORM = (
     "No contact explains the readings: told is one load of any form along the rod, by its net force and the place of its moment. "
     "Where several contacts may push, try --contacts auto."
 )
-OR_ANY_FORM = "One load of any form along the rod explains them too: it may be spread."
+OR_ANY_FORM = "One load of any form along the rod explains the readings too: what is there may be spread."
 Parts = list[tuple[Unknowns, Int[Tensor, " b"]]]
 StartFor = Callable[[Problem], StartRule]
 

@@ -76,7 +76,8 @@ def _count(options: Namespace, robot: Robot) -> int | str:
     contacts = options.contacts or "1"
     if options.location:
         if options.contacts not in (None, str(len(options.location))):
-            raise InputError(f"--contacts {options.contacts} but {len(options.location)} locations; give one --location per load")
+            given = f"{len(options.location)} place{'s' * (len(options.location) != 1)}"
+            raise InputError(f"--contacts {options.contacts}, but --location names {given}; give one place per load")
         if not all(0 < s <= L for s in options.location):
             raise InputError(f"--location {options.location}: must lie on the rod, above 0 and up to {L} m")
         if len(set(options.location)) < len(options.location):
@@ -130,7 +131,9 @@ def _warn_of_idle(options: Namespace, robot: Robot, shapes: Shapes) -> None:
         "--tension-std": options.tension_std is not None and not len(robot.tendons) and f"{options.robot} has no tendons",
         "hung_kg": "hung" in shapes.readings and "known weights are for torchrod calibrate; here they are found like any load",
         "--load-prior": options.load_prior != "contact" and options.contacts == "0" and "--contacts 0 leaves no load",
-        "--intervals sampled": options.intervals == "sampled" and _unused_intervals(options, whole),
+        "--intervals sampled": options.intervals == "sampled"
+        and options.one_frame
+        and "draws of one sample cannot have the error of a base frame that all share (--one-frame)",
         "--profile on": options.profile == "on" and not whole and "only RESULT.json and RESULT.npz have profiles (--out)",
     }
     for option, why in idle.items():
@@ -150,11 +153,8 @@ def _own_noise(seen: Bool[Tensor, "B P"]) -> str:
 
 
 def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
-    """Whether there are to be draws: of one hypothesis where its intervals are shown, of several to choose; of a large batch only
-    where that is asked for.
-    """
-    shown = bool((options.out and not options.out.endswith(".csv")) or options.plot)
-    if options.intervals == "gaussian" or not (shown or several):
+    """Whether there are to be draws: of a large batch only where that is asked for. several: hypotheses compete."""
+    if options.intervals == "gaussian":
         return False
     quick = kernel_walks(problem) and not options.one_frame
     if options.intervals == "sampled" or not quick:
@@ -170,14 +170,6 @@ def _sampled(options: Namespace, problem: Problem, several: bool) -> bool:
             stacklevel=2,
         )
     return few
-
-
-def _unused_intervals(options: Namespace, whole: bool) -> str:
-    if options.one_frame:
-        return "draws of one sample cannot have the error of a base frame that all share (--one-frame)"
-    if options.contacts == "auto" or options.load_prior in ("auto", "smooth"):
-        return ""
-    return "" if whole or options.plot else "only RESULT.json, RESULT.npz and FIGURE show intervals; name one by --out or --plot"
 
 
 def _check_enough(options: Namespace, problem: Problem) -> None:

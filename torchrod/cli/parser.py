@@ -39,7 +39,9 @@ class _Parser(ArgumentParser):
         self._negative_number_matcher = re.compile(r"-(\d[\d_]*\.?\d*|\.\d+)(e[+-]?\d+)?$|-(inf|infinity|nan)$", re.IGNORECASE)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        hint = "see torchrod --help; files come before options that take several values"
+        hint = "see torchrod --help"
+        if "<class 'float'>" in message or "required" in message:
+            hint += "; files come before options that take several values"
         raise InputError(f"{' '.join(str(message).split())} ({hint})") from ex
 
 

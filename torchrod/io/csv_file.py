@@ -109,7 +109,7 @@ def ignored(path: Path, what: str, unknown: list[str], known: list[str]) -> None
     """Say once what is left aside; refuse what looks like a slip of the pen, which would lose a measurement. Errors: InputError."""
     for name in unknown:
         if near := get_close_matches(name.strip().lower(), known, 1, ALIKE):
-            raise InputError(f"{path}: unknown {what} '{name.strip()[:40]}'; call it '{near[0]}', or something quite different")
+            raise InputError(f"{path}: unknown {what} '{name.strip()[:40]}'; if it is '{near[0]}', call it that; if not, rename it")
     names = ", ".join(f"'{name.strip()[:40]}'" for name in unknown[:5]) + (", ..." if len(unknown) > 5 else "")
     warnings.warn(
         f"{path}: {what}{'s' * (len(unknown) > 1)} {names} {'are' if unknown[1:] else 'is'} not known and ignored; "

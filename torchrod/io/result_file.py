@@ -294,14 +294,25 @@ def _load_table(result: Result) -> str:
             if "tip_force_lab_N" in of:
                 tip |= {f"force_lab_{axis}_N": v for axis, v in zip("xyz", of["tip_force_lab_N"][b], strict=True)}
             tip["magnitude_N"] = math.hypot(*of["tip"][b][:3])
+            tip["magnitude_std_N"] = _std_of_size(of["tip"][b][:3], result, b)
             writer.writerow([*head, "tip", *(tip.get(name, "") for name in header[len(head) + 1 :])])
         elif not loads:
             writer.writerow([*head, *[""] * (len(header) - len(head))])
     return text.getvalue()
 
 
-def _stream(file: IO[bytes], robot: str, texts: Iterator[str]) -> None:
-    file.write(f'{{"robot": {robot}, "results": [\n'.encode())
+def _std_of_size(F: list[float], result: Result, b: int) -> float | str:
+    """Of |F| at the tip (N), to first order; "" where it is not known."""
+    covariance, size = result.estimate.tip_covariance, math.hypot(*F)
+    if covariance is None or not size > 0:
+        return ""
+    way = torch.tensor(F, dtype=covariance.dtype) / size
+    return float((way @ covariance[b, :3, :3] @ way).clamp(min=0).sqrt())
+
+
+def _stream(file: IO[bytes], result: Result, texts: Iterator[str]) -> None:
+    markers = result.estimate.outlier.shape[1]
+    file.write(f'{{"robot": {json.dumps(result.robot)}, "markers": {markers}, "results": [\n'.encode())
     for b, text in enumerate(texts):
         file.write((",\n" * (b > 0) + text).encode())
     file.write(b"\n]}\n")
@@ -349,7 +360,7 @@ def write_result(path: str | Path, result: Result) -> None:
     if path.suffix == ".csv":
         put_text(path, _load_table(result))
     elif path.suffix == ".json":
-        put(path, lambda file: _stream(file, json.dumps(result.robot), _texts(result)))
+        put(path, lambda file: _stream(file, result, _texts(result)))
     else:
         content = _arrays(result)
         # Uncompressed: deflating random digits takes six times as long as estimating them, and saves a third.
@@ -421,7 +432,7 @@ def _record_of(asked: _Asked, opened: IO[bytes]) -> tuple[Values, Values | None]
     """The same of a RESULT.json."""
     content = json.load(opened)
     results = content["results"]
-    asked.check(content.get("robot"), None)
+    asked.check(content.get("robot"), content.get("markers"))
     record = results[asked.index([str(r["sample"]) for r in results])]
     loads, wrench = record["loads"], record["base_wrench"]
     keys = {"force": "force_local_N", "location": "location_m", "width": "width_m"}

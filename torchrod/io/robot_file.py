@@ -27,6 +27,7 @@ ROD_KEYS = {"length", "mass_per_length", "gravity", "reference_curvature", "sect
 MASS_KEYS = {"s", "mass"}
 SOFTEST, HARDEST = 1e4, 2e12  # Pa: below the softest silicone and above diamond
 RUBBER, SLENDER = 1e6, 1 / 40  # Pa, and a diameter over the length: so soft and so slender a rod does not hold itself
+MOST_GRAVITY = 100.0  # m/s^2
 MOST_COILS = 200  # turns of the unloaded rod
 ROD_LENGTHS = {"length", "diameter", "inner_diameter", "axes"}
 SECTION_LENGTHS = {"to", "diameter", "inner_diameter", "axes"}
@@ -92,7 +93,13 @@ def _moduli(where: dict[str, str], table: dict[str, Any], diameter: float, lengt
     if not SOFTEST <= E <= HARDEST:
         remedy = "is it in GPa or MPa? steel is 207e9" if E < SOFTEST else "steel is 207e9"
         raise InputError(f"{where['youngs_modulus']} is {E:g} Pa, which no rod has; give it in pascals ({remedy})")
-    if not 1e-5 * length <= diameter <= length or not 0.1 * E <= G <= E:
+    if diameter > length:
+        home = where["youngs_modulus"].removesuffix(".youngs_modulus")
+        raise InputError(
+            f"{home}: the section is {diameter:g} m across, more than the rod's length of {length:g} m; give both in metres, or as "
+            "diameter_mm and length_mm"
+        )
+    if not 1e-5 * length <= diameter or not 0.1 * E <= G <= E:
         home = where["youngs_modulus"].removesuffix(".youngs_modulus")
         warnings.warn(f"{home}: diameter {diameter} m, youngs_modulus {E} Pa, shear_modulus {G} Pa: check the units", stacklevel=2)
     elif E < RUBBER and diameter < SLENDER * length:
@@ -335,10 +342,17 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
     """The same from what a ROBOT.toml says; path: what refusals call it."""
     if "rod" not in content:
         raise InputError(f"{path}: has no [rod] table; give at least length, diameter, youngs_modulus and shear_modulus")
+    for key in content:
+        if key not in TOP_KEYS and (key in ROD_KEYS or key.removesuffix("_mm") in ROD_LENGTHS):
+            raise InputError(f"{path}: {key} stands outside of [rod]; put it below that line")
     as_table(str(path), content, TOP_KEYS)
+    if "poisson_ratio" in content["rod"]:
+        raise InputError(f"{path}: rod.poisson_ratio is not read; give shear_modulus = E / (2 (1 + nu)) instead")
     table = as_table(f"{path}: rod", in_si(f"{path}: rod", content["rod"], ROD_LENGTHS, {"angle"}), ROD_KEYS)
     rod = _rod(path, table)
     gravity = torch.tensor(as_numbers(f"{path}: rod.gravity", table.get("gravity", [0.0, 0.0, 0.0]), 3), dtype=DTYPE)
+    if float(gravity.norm()) > MOST_GRAVITY:
+        warnings.warn(f"{path}: rod.gravity is {gravity.tolist()}; give it in m/s^2 (the earth's is 9.81 m/s^2)", stacklevel=2)
     if bool(gravity.any()) and rod.mass == 0:
         warnings.warn(f"{path}: rod.gravity is given without mass_per_length, so nothing hangs; add it (kg/m)", stacklevel=2)
     base_pose_of(path, content)

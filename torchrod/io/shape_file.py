@@ -231,7 +231,9 @@ def _read_npz(path: Path, file: IO[bytes], units: str | None) -> Shapes:
             w not in ("T", "M", n) for w, n in zip(wanted[key], value.shape, strict=True)
         ):
             form = f"({', '.join(map(str, named[key]))}{',' * (len(named[key]) == 1)})"
-            raise InputError(f"{path}: array '{key}' has shape {value.shape}; expected {form} with P = {P} and B = {B}")
+            counts = f"P = {P}" if len(value.shape) < len(wanted[key]) else f"P = {P} and B = {B}"
+            alone = "; one sample has B = 1" if named[key][:1] == ("B",) and len(value.shape) < len(wanted[key]) else ""
+            raise InputError(f"{path}: array '{key}' has shape {value.shape}; expected {form} with {counts}{alone}")
     for key, value in data.items():
         if np.isinf(value).any() or (key in ("s", "offsets", "time") and np.isnan(value).any()):
             raise InputError(

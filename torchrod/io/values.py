@@ -3,6 +3,7 @@
 import math
 import tomllib
 from collections.abc import Collection
+from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from ..util.errors import InputError, shown
 from ..util.files import reading
 from .npz_file import why
 
+ALIKE = 0.8  # of two keys, from 0 to 1 (difflib): one may be meant for the other
 MOST_WHOLE = 10**300  # a whole number beyond it has no float
 
 
@@ -29,7 +31,9 @@ def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
         raise InputError(f"{where} must be a table of keys; known keys: {', '.join(sorted(known))}")
     for key in value:
         if key not in known:
-            raise InputError(f"{where}: unknown key {shown(key)}; known keys: {', '.join(sorted(known))}")
+            near = get_close_matches(key.lower(), sorted(known), 1, ALIKE)
+            meant = f"is it {near[0]}? " if near else ""
+            raise InputError(f"{where}: unknown key {shown(key)}; {meant}known keys: {', '.join(sorted(known))}")
     return value
 
 
