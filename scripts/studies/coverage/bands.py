@@ -16,6 +16,7 @@ from torchrod.model.load_families.smooth import TERMS
 
 PIECES, STEPS, MARKERS = 400, 40, 20  # point forces that a load is made of: steps end at each
 NOISES = 1e-3, 2.5e-3  # of the length
+AT_ONCE = 50  # shapes: each takes 20 MB
 LEAST = 0.1  # of the peak: where f(s) counts
 SIZE = 0.5, 1.5  # of the resultant, force scales; of loads that change sign, of their mean size
 
@@ -123,11 +124,14 @@ def posed(form: Form, noise: float, cases: int, seed: int = 1) -> tuple[tr.Probl
     t = (torch.arange(PIECES, dtype=torch.float64) + 0.5) / PIECES
     forces = torch.nn.functional.pad(density(t) * L / PIECES, (0, 1))
     s = torch.linspace(L / MARKERS, L, MARKERS, dtype=torch.float64)
-    shape = tr.solve_shape(robot, (tr.PointForces(forces, (L * t).expand(cases, -1)),), None, s, cases, STEPS)
-    p = shape.p + noise * L * torch.randn(shape.p.shape, generator=generator, dtype=torch.float64)
+    load, shapes = tr.PointForces(forces, (L * t).expand(cases, -1)), []
+    for rows in torch.arange(cases).split(AT_ONCE):
+        shapes.append(tr.solve_shape(robot, (load.take(rows),), None, s, len(rows), STEPS))
+    p, wrench = (torch.cat([getattr(shape, name) for shape in shapes]) for name in ("p", "base_wrench"))
+    p = p + noise * L * torch.randn(p.shape, generator=generator, dtype=torch.float64)
     unknowns = tr.Unknowns(tr.GaussianCoordinates(1, L, rod.force_scale))
     along = forces[..., 0] * turn.cos() + forces[..., 1] * turn.sin()
-    truth = Truth(density, along.sum(-1).abs(), (along * L * t).sum(-1) / along.sum(-1), shape.base_wrench[:, :3].norm(dim=-1))
+    truth = Truth(density, along.sum(-1).abs(), (along * L * t).sum(-1) / along.sum(-1), wrench[:, :3].norm(dim=-1))
     return tr.Problem(robot, unknowns, [tr.Markers(s, p, noise * L)]), truth
 
 
