@@ -322,3 +322,15 @@ def test_no_interval_of_a_place_leaves_the_rod():
     fit = estimate(Problem(rod, unknowns_of(rod), [Markers(s, p, 2e-3)]))
     assert float(fit.location_std) > 0.01
     assert float(fit.location_interval[0, 0, 0]) < float(fit.location_interval[0, 0, 1]) <= rod.rod.length
+
+
+def test_an_estimate_prints_its_loads():
+    """And not pages of covariances."""
+    push = PointForces(T([[[0.6, 0.0, 0.0]]]).expand(7, 1, 3), T([[0.3]]).expand(7, 1))
+    s = torch.linspace(0.02, 0.4, 20)
+    p = solve_shape(steel_rod(), (push,), None, s, 7).p
+    p[1] = torch.nan
+    lines = repr(estimate(posed(s, p, 1e-3))).splitlines()
+    assert lines[0] == "Estimate of 7 samples: 6 converged, 6 accepted" and lines[-1] == "  ..." and len(lines) == 7
+    assert lines[1].startswith("  0: 0.60") and lines[2] == "  1: no load"
+    assert float(lines[1].split(" N at ")[1].split()[0]) == pytest.approx(0.3, abs=1e-3)

@@ -114,6 +114,9 @@ def verdict(
     return outlier, chi2, dof, (chi2 < _limits(most)[dof.clamp(min=0)]) & most_inside
 
 
+MOST_SHOWN = 5  # samples, where an estimate is printed
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Everything known of B samples after the fit. Status codes are torchrod.Status; SI units; forces in the section frame.
@@ -173,6 +176,18 @@ class Estimate:
     coarse: Bool[Tensor, " B"]
     unstable: Bool[Tensor, " B"]
     rod_length: Float[Tensor, " B"]
+
+    def __repr__(self) -> str:
+        """How many samples came to what, and the loads of the first with their standard deviations; all else is in the fields."""
+        B, converged = len(self.status), int((self.status == int(Status.CONVERGED)).sum())
+        lines = [f"Estimate of {B} sample{'s' * (B != 1)}: {converged} converged, {int(self.accepted.sum())} accepted"]
+        columns = (self.magnitude, self.magnitude_std, self.location, self.location_std)
+        for b, rows in enumerate(zip(*(column[:MOST_SHOWN].tolist() for column in columns), strict=True)):
+            loads = [f"{F:.4g} +- {dF:.2g} N at {s:.4g} +- {ds:.2g} m" for F, dF, s, ds in zip(*rows, strict=True) if F == F]
+            if self.tip is not None and bool(torch.isfinite(self.tip[b]).all()):
+                loads.append(f"({', '.join(f'{v:.4g}' for v in self.tip[b, :3].tolist())}) N at the tip")
+            lines.append(f"  {b}: {'; '.join(loads) or 'no load'}")
+        return "\n".join([*lines, *["  ..."] * (B > MOST_SHOWN)])
 
     @property
     def warm_started(self) -> Bool[Tensor, " B"]:
