@@ -250,6 +250,7 @@ BAD = {
     "gravity above [rod]": ("gravity = [0, 0, -9.81]\n" + ROD, STRAIGHT, [], "gravity stands outside of [rod]; put it below"),
     "Poisson's ratio": (ROD + "poisson_ratio = 0.3\n", STRAIGHT, [], "give shear_modulus = E / (2 (1 + nu))"),
     "thicker than long": (ROD.replace("0.0014", "1.4"), STRAIGHT, [], "1.4 m across, more than the rod's length"),
+    "a rod that is none": ("rod = 5\n", STRAIGHT, [], "rod must be a table of keys"),
     "a turn in degrees": (ROD + "[base]\nrotation = [0, 90, 0]\n", STRAIGHT, [], "turns by 90 rad, more than once around"),
     "half a rotation": (ROD, "s,x,y,z,qx,qw\n0.1,0,0,0.1,0,1\n", [], "column 'qy' is missing; qx,qy,qz,qw come together"),
     "no rotation": (ROD, "s,x,y,z,qx,qy,qz,qw\n0.1,0,0,0.1,0,0,0,2\n", [], "a rotation is a unit quaternion"),

@@ -65,7 +65,7 @@ class Diagnosis:
     sample the markers without which a robust fit explains the others. couple (B,): where (m) loads, or those of one load more, are
     a large opposite couple, which no contact is; NaN where there is none. tip_instead (B,): where a force at the tip explains the
     shape with fewer contacts than without it. others: per sample what else explains its readings; () where nothing was looked for.
-    rivals: per sample a word on a hypothesis that is nearly as probable as the one that was chosen; () without probabilities.
+    rivals: per sample sentences on other loads that are nearly as probable as those of the fit, or more; () where none were tried.
     robot: per sample a sentence on what of the robot, or of the arc lengths, would explain the readings if it were off, or nothing.
     """
 

@@ -207,7 +207,7 @@ def analyze(
     elif named and evidence is None:
         rivals.append(untold(problem, found, settings, start))
     if named and all(getattr(c.unknowns.loads, "prior_name", "") in NARROW for c in competing):
-        rivals.append(spread(problem, found, parts, settings, start))
+        rivals.append(spread(problem, found, parts, settings, start, told=evidence is None))
     diagnosis = replace(diagnosis, rivals=tuple(" ".join(filter(None, words)) for words in zip(*rivals, strict=True)))
     if sampled and not shared and drawn is None:
         drawn = sampled_intervals(problem, found, parts, nu=settings.robust)

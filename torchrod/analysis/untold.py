@@ -23,7 +23,6 @@ from ..estimation.shared import Parts
 from ..estimation.solve import Settings, estimate_each
 from ..model.load_families import GaussianCoordinates
 from ..model.problem import Problem
-from ..model.sensors import TipWrench
 from .alternatives import read_at_few_places
 from .averaging import ONE_MORE
 from .count import CLOSE, MAX_CONTACTS, MOST_BESIDE_TIP, NEAR_TIP, UNTOLD, StartFor, always_cold, bic
@@ -49,7 +48,7 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
     loads = problem.unknowns.loads
     if not isinstance(loads, GaussianCoordinates) or not loads.count or loads.locations is not None:
         return tuple(said)
-    if problem.unknowns.tip != "none" or any(isinstance(sensor, TipWrench) for sensor in problem.sensors):
+    if problem.unknowns.tip != "none":
         return tuple(said)
     many, known = ~read_at_few_places(problem), torch.isfinite(fit.chi2)
     rows = (fit.accepted & many).nonzero().squeeze(-1)
@@ -66,11 +65,17 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
 
 
 def spread(
-    problem: Problem, fit: Estimate, parts: Parts, settings: Settings | None = None, start: StartFor = always_cold
+    problem: Problem,
+    fit: Estimate,
+    parts: Parts,
+    settings: Settings | None = None,
+    start: StartFor = always_cold,
+    told: bool = True,
 ) -> tuple[str, ...]:
-    """For every sample a sentence on one load spread along the rod that is more probable than its contacts, or "".
+    """For every sample a sentence on one load spread along the rod that is more probable than its contacts, or fewer, or "".
 
-    fit: of the problem with the unknowns of each of the parts. start: the rule that other fits start by.
+    fit: of the problem with the unknowns of each of the parts. start: the rule that other fits start by. told: whether the number
+    of contacts was, which the remedy then changes.
     """
     said = [""] * problem.batch
     for unknowns, index in parts:
@@ -83,11 +88,24 @@ def spread(
         wide = replace(loads, prior_name="distributed")
         others = _Others(own, wide, fit, bic(own, fit), replace(settings or Settings(), restarts=()), start)
         other, behind = others.of(1, unknowns.tip, rows)
+        for fewer in range(1, loads.count):  # of one push, any one load is more probable than several
+            left = (behind < -2 * math.log(MORE)).nonzero().squeeze(-1)
+            if len(left):
+                narrow = replace(others, loads=loads).of(fewer, unknowns.tip, rows[left])[1]
+                behind = behind.index_add(0, left, -narrow.clamp(max=0.0))
+        remedy = "--contacts 1 --load-prior auto" if told and loads.count > 1 else "--load-prior auto"
         for i in (behind < -2 * math.log(MORE)).nonzero().squeeze(-1).tolist():
-            odds = f"{min(math.exp(-0.5 * float(behind[i])), MOST_ODDS):.2g}"
             load = f"{float(other.magnitude[i, 0]):.3g} N about s = {1e3 * float(other.location[i, 0]):.3g} mm"
-            said[int(rows[i])] = f"One load spread along the rod ({load}) is {odds} times as probable; try --load-prior auto."
+            odds = f"{_times(-0.5 * float(behind[i]))} as probable as contacts"
+            said[int(rows[i])] = f"One load spread along the rod ({load}) is {odds}; try {remedy}."
     return tuple(said)
+
+
+def _times(log_odds: float) -> str:
+    odds = math.exp(min(log_odds, math.log(MOST_ODDS)))
+    if odds >= MOST_ODDS:
+        return f"more than {MOST_ODDS:.0f} times"
+    return f"{odds:.1f} times" if odds < 10 else f"{odds:.0f} times"
 
 
 @dataclass(frozen=True)
@@ -115,8 +133,9 @@ class _Others:
         return (torch.isfinite(behind) & (self.fit.cost[rows] - other.cost > BY_CHANCE)).nonzero().squeeze(-1).tolist()
 
     def better(self, other: Estimate, i: int, rows: Int[Tensor, " b"]) -> str:
-        """How much better other loads explain row i."""
-        return f" better (chi2 = {float(other.chi2[i]):.3g} instead of {float(self.fit.chi2[rows[i]]):.3g})"
+        """How much better other loads explain row i; of a robust fit the cost alone tells, as its chi^2 leaves outliers out."""
+        now, then = float(other.chi2[i]), float(self.fit.chi2[rows[i]])
+        return f" better (chi2 = {now:.3g} instead of {then:.3g})" if math.isinf(self.settings.robust) else " better"
 
 
 def _instead(others: _Others, rows: Int[Tensor, " b"]) -> Named:

@@ -1,6 +1,5 @@
 """The pose of a robot's base in the lab's frame, as [base] of ROBOT.toml or of a layout says it."""
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -53,11 +52,7 @@ def _rotation(where: str, value: object) -> Float[Tensor, "4"]:
             raise InputError(f"{where} is a reflection (its determinant is -1): one of its axes points the other way")
         return roma.rotmat_to_unitquat(roma.special_procrustes(R))
     if isinstance(value, list) and len(value) == 3:
-        turn = torch.tensor(as_numbers(where, value, 3), dtype=DTYPE)
-        if float(turn.norm()) > 2 * math.pi:
-            size = f"{float(turn.norm()):.3g} rad, more than once around"
-            raise InputError(f"{where} turns by {size}; give it in rad, or as rotation_deg")
-        return exponential(turn)
+        return exponential(torch.tensor(as_numbers(where, value, 3), dtype=DTYPE))
     raise InputError(
         f"{where} is {shown(value)}; give a unit quaternion [x, y, z, w], a rotation vector (rad) or the rows of a rotation matrix"
     )

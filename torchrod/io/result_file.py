@@ -307,7 +307,8 @@ def _std_of_size(F: list[float], result: Result, b: int) -> float | str:
     if covariance is None or not size > 0:
         return ""
     way = torch.tensor(F, dtype=covariance.dtype) / size
-    return float((way @ covariance[b, :3, :3] @ way).clamp(min=0).sqrt())
+    std = float((way @ covariance[b, :3, :3] @ way).clamp(min=0).sqrt())
+    return "" if math.isnan(std) else std
 
 
 def _stream(file: IO[bytes], result: Result, texts: Iterator[str]) -> None:

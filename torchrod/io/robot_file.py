@@ -335,6 +335,11 @@ def base_pose_of(path: Path, content: dict[str, Any]) -> BasePose | None:
     if "base" not in content:
         return None
     where = f"{path}: base"
+    turn = content["base"].get("rotation") if isinstance(content["base"], dict) else None
+    if isinstance(turn, list) and len(turn) == 3 and all(isinstance(v, int | float) for v in turn):
+        size = math.hypot(*turn)
+        if 2 * math.pi < size < math.inf:
+            raise InputError(f"{where}.rotation turns by {size:.3g} rad, more than once around; give it in rad, or as rotation_deg")
     return as_base_pose(where, in_si(where, content["base"], {"position"}, {"rotation"}))
 
 
@@ -346,7 +351,7 @@ def robot_of(path: Path, content: dict[str, Any]) -> Robot:
         if key not in TOP_KEYS and (key in ROD_KEYS or key.removesuffix("_mm") in ROD_LENGTHS):
             raise InputError(f"{path}: {key} stands outside of [rod]; put it below that line")
     as_table(str(path), content, TOP_KEYS)
-    if "poisson_ratio" in content["rod"]:
+    if isinstance(content["rod"], dict) and "poisson_ratio" in content["rod"]:
         raise InputError(f"{path}: rod.poisson_ratio is not read; give shear_modulus = E / (2 (1 + nu)) instead")
     table = as_table(f"{path}: rod", in_si(f"{path}: rod", content["rod"], ROD_LENGTHS, {"angle"}), ROD_KEYS)
     rod = _rod(path, table)

@@ -31,8 +31,9 @@ def as_table(where: str, value: object, known: set[str]) -> dict[str, Any]:
         raise InputError(f"{where} must be a table of keys; known keys: {', '.join(sorted(known))}")
     for key in value:
         if key not in known:
-            near = get_close_matches(key.lower(), sorted(known), 1, ALIKE)
-            meant = f"is it {near[0]}? " if near else ""
+            names = {name.lower(): name for name in sorted(known)}
+            near = get_close_matches(key.lower().removesuffix("_mm").removesuffix("_deg"), list(names), 1, ALIKE)
+            meant = f"is it {names[near[0]]}? " if near else ""
             raise InputError(f"{where}: unknown key {shown(key)}; {meant}known keys: {', '.join(sorted(known))}")
     return value
 
