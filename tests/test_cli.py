@@ -476,7 +476,7 @@ def test_options_with_nothing_to_act_on_are_told(tmp_path, capsys, monkeypatch, 
 
 
 def test_the_intervals_are_the_same_whatever_is_written(tmp_path, capsys, monkeypatch):
-    """Of draws by default, in the table, in LOADS.csv and in RESULT.json; those of a weak push are three times as wide."""
+    """Of draws by default, in the table, in LOADS.csv and in RESULT.json; of a weak push the covariance's are others."""
     monkeypatch.chdir(tmp_path)
     Path("r.toml").write_text(ROD)
     s = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..estimation import filter as ekf
 from ..estimation.evaluator import evaluator, normal
+from ..estimation.joint import eliminated
 from ..estimation.solve import linearize
 from ..estimation.starts import Origin, Start
 from ..mechanics.loads import GaussianLoads, Load
@@ -98,14 +99,14 @@ def score_test(problem: Problem, x: Float[Tensor, "B n"]) -> ScoreTest:
     # In equilibrium: slack at the tip would take up part of what a weak load does.
     at = linearize(wide, torch.cat([x[:, :g], nothing, x[:, g:]], -1), exact=True)
     assert at.tip is not None
-    c = torch.arange(g, g + 2 * PLACES)
-    A_cc, g_c, both = _eliminated(*at.tip.reduced(at.A, at.g), c)
+    c, T = torch.arange(g, g + 2 * PLACES), at.tip.T
+    found = eliminated(*at.tip.reduced(at.A, at.g), c)
+    both = torch.cat([found.G, found.step.unsqueeze(-1)], -1)
     # And how the base wrench follows: T of those that stay, T of the new force, d.
-    T_b = at.tip.T[:, :, _all_but(c, at.tip.T.shape[-1])]
-    follows = torch.cat([at.tip.T[:, :, c] - T_b @ both[..., :-1], at.tip.d.unsqueeze(-1) - T_b @ both[..., -1:]], -1)
+    follows = torch.cat([T[:, :, c], at.tip.d.unsqueeze(-1)], -1) - torch.cat([T[:, :, :g], T[:, :, g + 2 * PLACES :]], -1) @ both
     both = torch.cat([both, follows], 1)
     pair = 2 * torch.arange(PLACES).unsqueeze(-1) + torch.arange(2)
-    S = A_cc[:, pair.unsqueeze(-1), pair.unsqueeze(-2)]
+    S, g_c = found.S[:, pair.unsqueeze(-1), pair.unsqueeze(-2)], found.q
     F = ekf.solve_spd(S.flatten(0, 1), g_c[:, pair].flatten(0, 1).unsqueeze(-1)).squeeze(-1).unflatten(0, (-1, PLACES))
     drop = (F * g_c[:, pair]).sum(-1).nan_to_num(0.0)
     best = drop.argmax(-1)
@@ -121,25 +122,8 @@ def drop_by_tip_force(problem: Problem, x: Float[Tensor, "B n"], nu: float = mat
     N = normal(wide, evaluator(wide, nu).sums(at)).readings
     assert N.tip is not None
     A, g, _ = N.whole(at, wide.mean, wide.precision)
-    S, g_c, _ = _eliminated(*N.tip.reduced(A, g), first + torch.arange(3))
-    return ekf.decrement(S, g_c)
-
-
-def _all_but(new: Int[Tensor, " c"], n: int) -> Int[Tensor, " b"]:
-    """Those of n entries that are not new."""
-    kept = torch.ones(n, dtype=torch.bool)
-    kept[new] = False
-    return kept.nonzero().squeeze(-1)
-
-
-def _eliminated(
-    A: Float[Tensor, "B m m"], g: Float[Tensor, "B m"], new: Int[Tensor, " c"]
-) -> tuple[Float[Tensor, "B c c"], Float[Tensor, "B c"], Float[Tensor, "B b c+1"]]:
-    """Of the new entries, all others free: the information (1), the gradient that (2) begins with, and A_bb^-1 [A_bc, g_b]."""
-    b = _all_but(new, A.shape[-1])
-    A_bc = A[:, b][:, :, new]
-    both = ekf.solve_spd(A[:, b][:, :, b], torch.cat([A_bc, g[:, b].unsqueeze(-1)], -1))
-    return A[:, new][:, :, new] - A_bc.mT @ both[..., :-1], g[:, new] - (A_bc.mT @ both[..., -1:]).squeeze(-1), both
+    found = eliminated(*N.tip.reduced(A, g), first + torch.arange(3))
+    return ekf.decrement(found.S, found.q)
 
 
 def _at_best(

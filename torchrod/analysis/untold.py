@@ -46,9 +46,12 @@ def untold(problem: Problem, fit: Estimate, settings: Settings | None = None, st
     """
     said = [""] * problem.batch
     loads = problem.unknowns.loads
-    if not isinstance(loads, GaussianCoordinates) or not loads.count or loads.locations is not None:
-        return tuple(said)
-    if problem.unknowns.tip != "none":
+    if (
+        not isinstance(loads, GaussianCoordinates)
+        or not loads.count
+        or loads.locations is not None
+        or problem.unknowns.tip != "none"
+    ):
         return tuple(said)
     many, known = ~read_at_few_places(problem), torch.isfinite(fit.chi2)
     rows = (fit.accepted & many).nonzero().squeeze(-1)
@@ -88,11 +91,12 @@ def spread(
         wide = replace(loads, prior_name="distributed")
         others = _Others(own, wide, fit, bic(own, fit), replace(settings or Settings(), restarts=()), start)
         other, behind = others.of(1, unknowns.tip, rows)
-        for fewer in range(1, loads.count):  # of one push, any one load is more probable than several
+        ahead = torch.zeros_like(behind)  # fewer contacts: of one push, any one load is more probable than several
+        for fewer in range(1, loads.count):
             left = (behind < -2 * math.log(MORE)).nonzero().squeeze(-1)
             if len(left):
-                narrow = replace(others, loads=loads).of(fewer, unknowns.tip, rows[left])[1]
-                behind = behind.index_add(0, left, -narrow.clamp(max=0.0))
+                ahead[left] = torch.minimum(ahead[left], replace(others, loads=loads).of(fewer, unknowns.tip, rows[left])[1])
+        behind = behind - ahead
         remedy = "--contacts 1 --load-prior auto" if told and loads.count > 1 else "--load-prior auto"
         for i in (behind < -2 * math.log(MORE)).nonzero().squeeze(-1).tolist():
             load = f"{float(other.magnitude[i, 0]):.3g} N about s = {1e3 * float(other.location[i, 0]):.3g} mm"

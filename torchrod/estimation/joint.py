@@ -38,11 +38,12 @@ FARTHEST = 1.0  # of a parameter's size, in one step
 
 @dataclass(frozen=True)
 class Eliminated:
-    """(1) for B samples: G = A_xx^-1 A_xz (B, n, k), S (B, k, k), q (B, k)."""
+    """(1) for B samples: G = A_xx^-1 A_xz (B, n, k), S (B, k, k), q (B, k); step (B, n): A_xx^-1 g_x, of x where z stays."""
 
     G: Float[Tensor, "B n k"]
     S: Float[Tensor, "B k k"]
     q: Float[Tensor, "B k"]
+    step: Float[Tensor, "B m"]
 
 
 def eliminated(A: Float[Tensor, "B m m"], g: Float[Tensor, "B m"], shared: Int[Tensor, " k"]) -> Eliminated:
@@ -56,7 +57,7 @@ def eliminated(A: Float[Tensor, "B m m"], g: Float[Tensor, "B m"], shared: Int[T
     )
     S = A[:, shared][:, :, shared] - A_xz.mT @ both[..., :-1]
     q = g[:, shared] - (A_xz.mT @ both[..., -1:]).squeeze(-1)
-    return Eliminated(both[..., :-1], S, q)
+    return Eliminated(both[..., :-1], S, q, both[..., -1])
 
 
 @dataclass(frozen=True)

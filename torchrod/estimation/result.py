@@ -183,7 +183,9 @@ class Estimate:
         lines = [f"Estimate of {B} sample{'s' * (B != 1)}: {converged} converged, {int(self.accepted.sum())} accepted"]
         columns = (self.magnitude, self.magnitude_std, self.location, self.location_std)
         for b, rows in enumerate(zip(*(column[:MOST_SHOWN].tolist() for column in columns), strict=True)):
-            loads = [f"{F:.4g} +- {dF:.2g} N at {s:.4g} +- {ds:.2g} m" for F, dF, s, ds in zip(*rows, strict=True) if F == F]
+            loads = [
+                f"{F:.4g} +- {dF:.2g} N at {s:.4g} +- {ds:.2g} m" for F, dF, s, ds in zip(*rows, strict=True) if not math.isnan(F)
+            ]
             if self.tip is not None and bool(torch.isfinite(self.tip[b]).all()):
                 loads.append(f"({', '.join(f'{v:.4g}' for v in self.tip[b, :3].tolist())}) N at the tip")
             lines.append(f"  {b}: {'; '.join(loads) or 'no load'}")

@@ -142,10 +142,8 @@ def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) ->
     found = tr.analyze(problem, tr.contact_hypotheses(problem, "auto" if prior == "auto" else 1, prior), sampled=True)
     cpu = time.process_time() - begun
     assert found.profile is not None and found.intervals is not None
-    f, (low, high) = (
-        truth.density(found.profile.s / problem.robot.rod.length).norm(dim=-1),
-        found.profile.band[..., 2, :].unbind(-1),
-    )
+    f = truth.density(found.profile.s / problem.robot.rod.length).norm(dim=-1)
+    low, high = found.profile.band[..., 2, :].unbind(-1)
     peak, inside = f.amax(-1, keepdim=True), (low <= f) & (f <= high)
     one = torch.zeros(cases, dtype=torch.bool)
     for unknowns, rows in found.parts:
@@ -168,6 +166,12 @@ def measured(form: Form, noise: float, prior: str, cases: int, seed: int = 1) ->
 ROWS = [f"{name}, {100 * noise:g} %" for name in FORMS for noise in NOISES[: 1 if name == OF_THE_PRIOR else None]]
 
 
+def form_of(row: str) -> tuple[str, float]:
+    """The name of its form, and its noise (of the length)."""
+    name, noise = row.rsplit(", ", 1)
+    return name, float(noise.removesuffix(" %")) / 100
+
+
 def head(cases: int) -> list[str]:
     """Of the table."""
     return [
@@ -188,10 +192,9 @@ def head(cases: int) -> list[str]:
 
 def line(row: str, cases: int) -> str:
     """One line of it."""
-    name, noise = row.rsplit(", ", 1)
-    cells = []
+    (name, noise), cells = form_of(row), []
     for prior in ("auto", "smooth"):
-        held = measured(FORMS[name], float(noise.removesuffix(" %")) / 100, prior, cases)
+        held = measured(FORMS[name], noise, prior, cases)
         of_one = ["-", "-"] if name in WITHOUT_PLACE else [f"{100 * share:.1f}" for share in (held.force, held.place)]
         cells += [f"{100 * held.band:.1f}", f"{held.width:.2f}", *of_one, f"{100 * held.resultant:.1f}", f"{held.cpu:.2f}"]
     return f"| {row} | {' | '.join(cells)} |"

@@ -22,8 +22,6 @@ HEAD = [
     "| what there is | contacts told | cases | accepted | held | named | silent | CPU |",
     "|" + "---|" * 8,
 ]
-
-
 SPREAD = "uniform over 30 % of the rod", "uniform over 60 %", "ramp", "half sine"
 
 
@@ -44,7 +42,7 @@ ROWS: dict[str, tuple[Kind | str, int]] = {
     "weak-noisy": (_beside((0.1, 0.5), 2.5e-3), 1),
     "strong": (_beside((0.3, 1.0), 1e-3), 1),
     "strong-noisy": (_beside((0.3, 1.0), 2.5e-3), 1),
-    **{row: (row, 1) for row in bands.ROWS if row.rsplit(", ", 1)[0] in SPREAD},
+    **{row: (row, 1) for row in bands.ROWS if bands.form_of(row)[0] in SPREAD},
     "two-as-one": (TOLD["two"], 1),
     "close-as-one": (TOLD["close"], 1),
     "opposed-as-one": (TOLD["opposed"], 1),
@@ -56,9 +54,9 @@ def line(name: str, cases: int) -> str:
     """One line of the table."""
     kind, contacts = ROWS[name]
     if isinstance(kind, str):
-        form, noise = kind.rsplit(", ", 1)
-        problem, truth = bands.posed(bands.FORMS[form], float(noise.removesuffix(" %")) / 100, cases, seed=2)
-        what, couple = f"one load, {form}, {noise} noise", False
+        form, noise = bands.form_of(kind)
+        problem, truth = bands.posed(bands.FORMS[form], noise, cases, seed=2)
+        what, couple = f"one load, {kind} noise", False
     else:
         problem, truth = posed(kind, cases, seed=2)
         what, couple = kind.name, kind.tip == "moment"
