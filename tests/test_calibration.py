@@ -360,19 +360,28 @@ gravity = [0, 0, -9.81]
 """
 
 
-@pytest.mark.parametrize("push", [(0.18, 0.4, 0.2), (0.1, 1.0, 0.0), (0.27, -0.3, 0.1)])
+@pytest.mark.parametrize(
+    ("push", "gravity"),
+    [
+        ((0.18, 0.4, 0.2), "0, 0, -9.81"),
+        ((0.1, 1.0, 0.0), "0, 0, -9.81"),
+        ((0.27, -0.3, 0.1), "0, 0, -9.81"),
+        ((0.18, 0.4, 0.2), "9.81, 0, 0"),
+    ],
+)
 @pytest.mark.many_fits
-def test_a_shape_that_something_pushes_calibrates_nothing(tmp_path, capsys, push):
+def test_a_shape_that_something_pushes_calibrates_nothing(tmp_path, capsys, push, gravity):
     """It once came to hundreds of kg/m, known to a millionth, with a chi^2 of -1e137, and was written."""
     (tmp_path / "upright.toml").write_text(STANDING)
     robot, s = read_robot(tmp_path / "upright.toml"), torch.linspace(0.025, 0.3, 12)
     p = solve_shape(robot, (PointForces(T([[[*push[1:], 0.0]]]), T([[push[0]]])),), None, s, 1).p
     positions = p + 5e-4 * torch.randn(p.shape, generator=torch.Generator().manual_seed(1))
-    path, shapes = files(tmp_path, STANDING, Shapes(s, positions, ["0"]))
+    path, shapes = files(tmp_path, STANDING.replace("0, 0, -9.81", gravity), Shapes(s, positions, ["0"]))
     out = tmp_path / "out.toml"
     assert main(["calibrate", path, shapes, "--noise", "5e-4", "--out", str(out)]) == 0
     captured = capsys.readouterr()
     assert "out.toml: not written" in captured.err and not out.exists()
+    assert ("% of its length" in captured.err) == (gravity == "9.81, 0, 0")
     assert "Converged." not in captured.out and "chi2/dof -" not in captured.out
 
 

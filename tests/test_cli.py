@@ -18,6 +18,7 @@ import torch
 from tests.conftest import reference
 from tests.robots import csv_of, steel_rod, toml_of
 from torchrod import (
+    InputError,
     Markers,
     PointCoordinates,
     PointForces,
@@ -494,6 +495,34 @@ def test_the_intervals_are_the_same_whatever_is_written(tmp_path, capsys, monkey
     assert ends == load["interval_95"]["magnitude_N"]
     assert f"+- {(ends[1] - ends[0]) / 3.92:.2f}" in tables[0]
     assert abs((ends[1] - ends[0]) / 3.92 - float(row["magnitude_std_N"])) > 0.1 * float(row["magnitude_std_N"])
+
+
+def test_the_row_of_a_force_at_the_tip_says_how_well_it_is_known(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("r.toml").write_text(ROD)
+    s = torch.linspace(0.02, 0.4, 20, dtype=torch.float64)
+    push = PointForces(torch.tensor([[[0.6, 0.2, 0.0]]]), torch.tensor([[0.4]]))
+    write_shapes("s.csv", Shapes(s, solve_shape(read_robot("r.toml"), (push,), None, s, 1).p, ["0"]))
+    for out in ("r.csv", "r.npz"):
+        assert (
+            main(["estimate", "r.toml", "s.csv", "--noise", "1e-3", "--contacts", "0", "--unknown-tip", "force", "--out", out]) == 0
+        )
+    (row,) = csv.DictReader(Path("r.csv").read_text().splitlines())
+    with np.load("r.npz") as fit:
+        F, C = fit["tip"][0, :3], fit["tip_covariance"][0, :3, :3]
+    assert row["load"] == "tip" and float(row["magnitude_std_N"]) == pytest.approx(math.sqrt(F @ C @ F) / float(np.linalg.norm(F)))
+
+
+def test_gravity_in_another_unit_is_told(tmp_path):
+    (tmp_path / "r.toml").write_text(ROD + "mass_per_length = 0.01\ngravity = [0, 0, -9810]\n")
+    with pytest.warns(UserWarning, match=r"rod.gravity is \[0.0, 0.0, -9810.0\]; give it in m/s\^2"):
+        read_robot(tmp_path / "r.toml")
+
+
+def test_one_sample_of_an_npz_is_a_batch_of_one(tmp_path):
+    np.savez(tmp_path / "s.npz", s=np.linspace(0.1, 0.4, 10), positions=np.zeros((10, 3)))
+    with pytest.raises(InputError, match=r"has shape \(10, 3\); expected \(B, P, 3\) with P = 10; one sample has B = 1"):
+        read_shapes(tmp_path / "s.npz", steel_rod())
 
 
 def test_a_table_of_loads_is_not_drawn(tmp_path, capsys):
